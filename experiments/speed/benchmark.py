@@ -171,6 +171,14 @@ def bundle_task(config: Config) -> list[Row]:
         same["ratio"] = same["peer_s"] and same["peer_s"] / shared
         rows.append(_work.row(f"{task}, {devices} CPU devices", shared, **same))
 
+    single = [jax.tree.map(lambda a: jnp.asarray(a, jnp.float32), a) for a in (lens, waves, points)]
+    call, measured = compiled(
+        functools.partial(_work.hits, single[0], field, distance), *single[1:]
+    )
+    off = float(jnp.max(jnp.abs(call()[0] - spot)))
+    seconds = _common.medians([call], config.repeats)[0]
+    rows.append(_work.row(f"{task}, float32", seconds, ours_error=off, **measured))
+
     def square(lens):
         return jnp.mean(_work.hits(lens, field, distance, waves, points)[0] ** 2)
 
@@ -179,6 +187,9 @@ def bundle_task(config: Config) -> list[Row]:
     rows.append(_work.row(f"{task} and their gradient", back, **measured))
     for row in rows:
         row["ours_rays_per_s"] = config.bundle / row["ours_s"]
+        for who in ("ours", "peer"):  # surfaces, the stop among them, and the sensor
+            seconds = row[f"{who}_s"]
+            row[f"{who}_surfaces_per_s"] = seconds and config.bundle * (lens.count + 1) / seconds
         if row["peak_mb"] is not None:
             row["bytes_per_ray"] = row["peak_mb"] * 2**20 / config.bundle
     return rows
@@ -256,6 +267,9 @@ TASKS = {
 }
 
 
+RATES = "ours_surfaces_per_s", "peer_surfaces_per_s"
+
+
 def run(config: Config, run: Run) -> dict[str, Any]:
     """Runs the tasks one by one."""
     # Programs saved by another run would hide the time of compilation.
@@ -302,6 +316,14 @@ def tables(results: dict[str, Any]) -> dict[str, str]:
     if results.get("profile"):
         found["benchmark, profile"] = _profile.summary(results["profile"])
         found["benchmark, unsolved"] = _profile.reasons(results["profile"])
+    rates = [
+        (row["task"], *(f"{row[key] / 1e6:.3g}" if row[key] else "" for key in RATES))
+        for row in results["rows"]
+        if "ours_surfaces_per_s" in row
+    ]
+    if rates:
+        header_of_rates = "work", "drt_jax, 1e6 rays x surfaces / s", "batoid"
+        found["benchmark, rates"] = _common.table(header_of_rates, rates)
     return found | {
         "benchmark": _common.table(header, lines),
         "benchmark, counts": _common.table(counts, results["counts"].items()),
