@@ -208,14 +208,14 @@ def _chief_rays(lens: Lens, scene: Scene) -> _ChiefRays:
     """The chief rays of the points of a scene that fits the lens."""
     if known_values((lens, scene)) is None:
         return _traced(lens, scene, SEARCH)
-    known = known_rays(lens, scene, CHIEF.T.astype(lens.curvature.dtype))
+    count, shape, far = math.prod(scene.shape), scene.shape, scene.distance
+    far = jnp.broadcast_to(far, shape).reshape(-1) if far.ndim else far
+    line = scene.at(jnp.broadcast_to(scene.field, (*shape, 2)).reshape(-1, 2), far)
+    known = known_rays(lens, line, CHIEF.T.astype(lens.curvature.dtype))
     # Padding lets similar numbers of points share a program.
-    count, shape = math.prod(scene.shape), scene.shape
     pad = lambda a: jnp.resize(a, (count + -count % _POINTS, *a.shape[1:]))  # noqa: E731
-    fields = pad(jnp.broadcast_to(scene.field, (*shape, 2)).reshape(-1, 2))
-    far = scene.distance
-    far = pad(jnp.broadcast_to(far, shape).reshape(-1)) if far.ndim else far
-    found = _traced(lens, scene.at(fields, far), jax.tree.map(pad, known))
+    padded = line.at(pad(line.field), pad(far) if far.ndim else far)
+    found = _traced(lens, padded, jax.tree.map(pad, known))
     return jax.tree.map(lambda a: a[:count].reshape(*shape, *a.shape[1:]), found)
 
 
