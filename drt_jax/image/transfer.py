@@ -307,7 +307,7 @@ def _of_waves(
         shifted by `shear` (2, W)."""
         step = jnp.maximum(high - low - jnp.abs(shear), 0) / cells
         # A loop, so that `pupil` is compiled once.
-        centres = middle + jnp.stack([shear, -shear]) / 2
+        centres = middle[None] + jnp.stack([shear, -shear]) / 2
         both = jax.lax.map(lambda centre: pupil(centre, step), centres)
         first, second = (jax.tree.map(lambda a: a[k], both) for k in range(2))
         inside = shared_part(first, second)
