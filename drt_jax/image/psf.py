@@ -196,17 +196,19 @@ def chosen_psf(
             pairs = ((beam, w) for beam in beams for w in range(waves.size))
             return max(_misfit(b, waves, w, pixels.side, rounded, degree) for b, w in pairs)
 
-        ((degree, beams),), error = refine(fits(), misfit, tolerance, together=1)
-        if error > tolerance:
+        # The fit may take half of the tolerance; what it leaves is for the cells.
+        ((degree, beams),), error = refine(fits(), misfit, tolerance / 2, together=1)
+        if error > tolerance / 2:
             warn(
                 f"polynomials of degree {degree} give back the rays to {error:.1e} only, not to "
-                f"{tolerance:.1e}"
+                f"half of {tolerance:.1e}"
             )
         beams = [dataclasses.replace(b, degree=degree, azimuths=degree) for b in beams]
         view = _View(lens, waves, beams, pixels, norm)
         worst = max(rounded.get("phase", 0.0), view.hit_error(kind))
         view = dataclasses.replace(view, rounded=worst)
-        return view.sampling(kind, rule_of(degree), tolerance), view
+        left = max(tolerance - error, tolerance / 2)
+        return view.sampling(kind, rule_of(degree), left), view
 
 
 # Each number of cells needs its own compiled program, which runs once for each beam.
