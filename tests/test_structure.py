@@ -48,7 +48,7 @@ ROOMS = {
     "drt_jax/check": 298,
     "drt_jax/design": 2383,
     "drt_jax/files": 2928,
-    "drt_jax/image": 2992,
+    "drt_jax/image": 2993,
     "drt_jax/learn": 624,
     "drt_jax/lens": 1478,
     "drt_jax/pupil": 776,
@@ -59,7 +59,7 @@ ROOMS = {
     "experiments/imaging": 424,
     "experiments/paper": 608,
     "experiments/runs": 453,
-    "experiments/speed": 1260,
+    "experiments/speed": 1279,
     "experiments/together": 411,
     "experiments/trust": 1851,
 }
