@@ -11,6 +11,7 @@ import experiments
 
 from . import _common
 
+_PREFIXES = "paper", "gpu"  # folders of results
 _BLOCK = re.compile(r"(<!-- table: (.+?) -->\n).*?(<!-- end -->)", re.DOTALL)
 
 
@@ -25,17 +26,25 @@ def all_tables() -> dict[str, str]:
     for path in sorted((_common.ROOT / "results").rglob("results.json")):
         experiment = _common.experiment(path.parent.name, path.parents[1].name)
         tables = experiment.tables(_common.read_results(path.parent))
-        # Those of configs/paper/ have the names of the shorter runs.
-        prefix = "paper: " if path.parents[1].name == "paper" else ""
+        # Those of configs/paper/ have the names of the shorter runs, those of a GPU of a CPU's.
+        of = path.parents[1].name
+        prefix = f"{of}: " if of in _PREFIXES else ""
         found |= {prefix + name: table for name, table in tables.items()}
     return found
 
 
 def filled(text: str, tables: dict[str, str]) -> str:
-    """A page with its blocks replaced. ConfigError for an unknown table."""
-    for _, name, _ in _BLOCK.findall(text):
+    """A page with its blocks replaced. Those of a GPU may be missing, and stay as they are;
+    ConfigError for another table that is not known."""
+
+    def block(found: re.Match) -> str:
+        name = found[2]
+        if name.startswith("gpu: ") and name not in tables:
+            return found[0]
         _common.require_known("tables", (name,), tables)
-    return _BLOCK.sub(lambda m: f"{m[1]}{tables[m[2]]}\n{m[3]}", text)
+        return f"{found[1]}{tables[name]}\n{found[3]}"
+
+    return _BLOCK.sub(block, text)
 
 
 def main() -> None:

@@ -1,14 +1,14 @@
-"""FFT and matrix Fourier PSFs of other programs on our pixels; each program may be missing.
+"""PSFs and transfer functions by waves of other programs; each program may be missing.
 
 A peer returns samples of the irradiance. A pixel collects the difference, across it, of a cubic
 spline through their running sum.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import jax.numpy as jnp
 import numpy as np
-from scipy.interpolate import RectBivariateSpline
+from scipy.interpolate import CubicSpline, RectBivariateSpline
 
 import drt_jax
 from drt_jax import Scene
@@ -21,22 +21,27 @@ from . import _peers
 _UM = 1e3  # per mm
 
 
-def collected(samples: np.ndarray, step: float, pixel: float, size: int) -> np.ndarray:
+def collected(
+    samples: np.ndarray, steps: tuple[float, float], pixel: float, size: int
+) -> np.ndarray:
     """Fractions (size, size) of the light of samples (n, n) on pixels about the middle sample
-    [n // 2, n // 2]. step: distance of the samples, mm. pixel: side of a pixel, mm."""
+    [n // 2, n // 2]. steps: distances of the samples along y and x, mm. pixel: side of a pixel,
+    mm."""
     n = samples.shape[0]
     total = np.pad(np.cumsum(np.cumsum(samples, 0), 1), ((1, 0), (1, 0)))
-    edges = (np.arange(n + 1) - n // 2 - 0.5) * step
-    below = RectBivariateSpline(edges, edges, total / total[-1, -1])
+    edges = np.arange(n + 1) - n // 2 - 0.5
+    below = RectBivariateSpline(*(edges * step for step in steps), total / total[-1, -1])
     borders = (np.arange(size + 1) - size / 2) * pixel
     return np.diff(np.diff(below(borders, borders), axis=0), axis=1)
 
 
 def pupil(
-    lens: drt_jax.Lens, field: float, wavelength: np.ndarray, rule: BeamRule, count: int
-) -> tuple[np.ndarray, float, np.ndarray]:
+    lens: drt_jax.Lens, field: float, wavelength: np.ndarray, rule: BeamRule, count: int,
+    centre: np.ndarray | None = None,
+) -> tuple[np.ndarray, float, np.ndarray]:  # fmt: skip
     """The input of prysm for one wavelength (1,) and an object at infinity: the pupil function on a
-    square grid of direction cosines, the step of the grid, and the centre (2,) of the image, mm."""
+    square grid of direction cosines, the step of the grid, and the centre (2,) of the image, mm: by
+    default that of the light."""
     scene = checked_scene(lens, Scene.point(field, np.inf, wavelength))
     beam = trace_beam(lens, scene, rule)
     low, high = (np.asarray(a)[:, 0] for a in beam.directions_extent())
@@ -44,7 +49,8 @@ def pupil(
     grid = jnp.asarray(middle[:, None]), jnp.full((2, 1), step)
     function = pupil_function(lens, beam, scene.wavelengths, count)
     density, inside, phase = (np.asarray(a)[0] for a in function(*grid)[:3])
-    centre = np.asarray(centroid_and_variances(beam.hits[:, -1], beam.weights)[0])[:, 0]
+    if centre is None:
+        centre = np.asarray(centroid_and_variances(beam.hits[:, -1], beam.weights)[0])[:, 0]
     side = (np.arange(count) - (count - 1) / 2) * step
     x, y = np.meshgrid(side, side)
     phase = phase + 2 * np.pi * _UM / wavelength[0] * (x * centre[0] + y * centre[1])
@@ -65,9 +71,68 @@ def optiland(numbers: _peers.Lens, pixel: float, size: int, rays: int, grid: int
     def call() -> np.ndarray:
         found = FFTPSF(optic, field, numbers.wavelengths[0], num_rays=rays, grid_size=grid)
         step = found._get_psf_units(found.psf)[0] / grid / _UM
-        return collected(np.asarray(found.psf), step, pixel, size)
+        return collected(np.asarray(found.psf), (step, step), pixel, size)
 
     return call
+
+
+def optiland_contrast(numbers: _peers.Lens, samples: int, frequencies: Sequence[float]) -> Callable:
+    """call() -> (2, N): Optiland's FFT MTF at the first wavelength, tangential and sagittal, by a
+    cubic spline through its frequencies (HuygensMTF takes 2 s for 64 rays along a side, 9 s for
+    128, and is off by 0.1). samples: rays along a side. frequencies: (N,), cycles/mm."""
+    from optiland import backend
+    from optiland.mtf import FFTMTF
+
+    backend.set_backend("numpy")
+    optic = _peers._optiland_system(numbers, numbers.index[:, 0], numbers.wavelengths[0])
+    given = optic, [(0, 1 if numbers.field else 0)], numbers.wavelengths[0]
+
+    def call() -> np.ndarray:
+        found = FFTMTF(*given, num_rays=samples)
+        lines = zip((found.freq_tang[0], found.freq_sag[0]), found.mtf[0])
+        return np.array([CubicSpline(*line)(frequencies) for line in lines])
+
+    return call
+
+
+def batoid(numbers: _peers.Lens, samples: int) -> Callable:
+    """call() -> (psf, (dy, dx)): batoid's FFT PSF about the chief ray at the first wavelength, and
+    the steps of its samples, mm. samples: rays along a side."""
+    import batoid
+    from batoid.analysis import fftPSF
+
+    variant = numbers.variants[0]
+    numbers.clear[numbers.stop] = numbers.semi  # rays of a square grid are cut by the stop
+    optic = _peers._batoid_optic(numbers, variant, numbers.index[:, 0])
+    place, radius = variant.pupil
+    at = batoid.CoordSys(origin=[0, 0, place])
+    # Its rays fill a little more than the paraxial pupil.
+    known = {"pupilSize": 2.1 * radius, "backDist": place + 2 * radius + 10.0}
+    known |= {"stopSurface": batoid.Interface(batoid.Plane(), coordSys=at)}
+    known |= {"sphereRadius": sum(variant.gaps[numbers.stop :])}
+    optic = batoid.CompoundOptic(
+        optic.items, name="lens", inMedium=optic.inMedium, outMedium=optic.outMedium, **known
+    )
+    # Its rays go towards -z, along the same lines for a field of the other sign.
+    given = optic, 0.0, -numbers.field, numbers.wavelengths[0] / _UM, "gnomonic", samples
+
+    def call() -> tuple[np.ndarray, tuple[float, float]]:
+        found = fftPSF(*given)
+        # The first vector is along x, while the first axis of the array is along y.
+        across, up = map(np.linalg.norm, found.primitiveVectors)
+        return np.asarray(found.array), (float(up), float(across))
+
+    return call
+
+
+def contrast_of(
+    samples: np.ndarray, steps: tuple[float, float], frequencies: Sequence[float]
+) -> np.ndarray:
+    """Modulus of the transfer function (2, N), tangential and sagittal, of samples [y, x] of the
+    irradiance. steps: along y and x, mm. frequencies: (N,), cycles/mm."""
+    lines = [(samples.sum(axis=1 - axis), step) for axis, step in enumerate(steps)]
+    waves = [np.exp(-2j * np.pi * np.outer(frequencies, np.arange(len(a)) * d)) for a, d in lines]
+    return np.abs([wave @ light for wave, (light, _) in zip(waves, lines)]) / samples.sum()
 
 
 def prysm(

@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 
 import jax
 import numpy as np
+from jax import Array
 
 import drt_jax
 from drt_jax import Lens, Scene
@@ -33,39 +34,42 @@ class Try(NamedTuple):
     error: float
 
 
-def aimed(lens: Lens, scene: Scene, order: int) -> _peers.Rays:
+def aimed(lens: Lens, scene: Scene, order: int, values: Array) -> _peers.Rays:
     """The nodes of our rule of an order for a field along y, as rays that we aimed, through the
-    lens and each of its `_peers.Lens.variants`."""
+    lens with each row of values."""
     points, weights = (np.asarray(a) for a in drt_jax.pupil.half_disc(order, order + 1))
     trace = jax.vmap(lambda v: drt_jax.trace_rays(changed(lens, v), scene, points))
-    rays = jax.jit(trace)(_peers.shifted(lens))
+    rays = jax.jit(trace)(values)
     launch = np.asarray(rays.points[..., 0, :]), np.asarray(rays.directions[..., 0, :])
     return _peers.Rays(points, weights, launch=launch, free=(0, 1))
 
 
-def ways(lens: Lens, scene: Scene, sizes: Iterable[int], orders: Iterable[int]) -> Iterable[tuple]:
+def ways(
+    lens: Lens, scene: Scene, sizes: Iterable[int], orders: Iterable[int], values: Array
+) -> Iterable[tuple]:
     """(name, rays) of all samplings: each pattern at the paraxial pupil and at the stop, and our
-    nodes, launched by us."""
+    nodes, launched by us. values: of the variants of the lens."""
     for aim, where in (("paraxial", "paraxial pupil"), ("iterative", "aimed at the stop")):
         for kind, pattern in _peers.PATTERNS.items():
             for size in orders if kind == "Gaussian" else sizes:
                 yield f"{kind}, {where}", partial(_peers.rays_of, pattern, size, aim)
     for order in orders:
-        yield "our nodes", partial(aimed, lens, scene, order)
+        yield "our nodes", partial(aimed, lens, scene, order, values)
 
 
 def peers(
-    numbers: _peers.Lens, samplings: Iterable[tuple], error: Callable, gradient: bool
+    numbers: _peers.Lens, samplings: Iterable[tuple], error: Callable, what: Callable
 ) -> tuple[list[Try], dict[str, str]]:
-    """All tries of other programs, and why there are none, by program."""
+    """All tries of other programs, and why there are none, by program. what: call of a program's
+    `_peers.Spots`, a lens and rays."""
     found: list[Try] = []
     notes: dict[str, str] = {}
     for name, rays_of in samplings:
-        for program, makers in _peers.SPOTS.items():
+        for program, spots in _peers.SPOTS.items():
 
             def make() -> tuple:
                 rays = rays_of()
-                call = makers[1](numbers, rays) if gradient else makers[0](numbers, rays)
+                call = what(spots, numbers, rays)
                 return len(rays.weights), call, error(call())
 
             got = _work.peer(program, make)

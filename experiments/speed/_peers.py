@@ -98,10 +98,12 @@ class Lens:
 
     clear: (S,), radius of each clear aperture, mm; inf at the stop, which rays fill.
 
-    variants: the lens, and the 4 S lenses that `shifted` tells.
+    variants: the lens with each row of `values`, (V, P); None: of `shifted`, the lens and 4 S more.
     """
 
-    def __init__(self, lens: drt_jax.Lens, field: float, distance: float, wavelengths) -> None:
+    def __init__(
+        self, lens: drt_jax.Lens, field: float, distance: float, wavelengths, values: Any = None
+    ) -> None:
         if set(lens.forms) != {"asphere"} or lens.phase or lens.elements or lens.tilt is not None:
             raise ValueError("no centred lens of aspheres")
         self.conic = np.asarray(lens.conic, float)[:-1]
@@ -111,7 +113,8 @@ class Lens:
         self.clear = np.array(lens.semi_diameter, float)[:-1]
         self.clear[lens.stop] = np.inf
         self.field, self.distance, self.wavelengths = field, distance, tuple(wavelengths)
-        self.variants = [self._variant(lens, values) for values in shifted(lens)]
+        rows = shifted(lens) if values is None else values
+        self.variants = [self._variant(lens, row) for row in rows]
         self.curvature, self.gaps, self.pupil = self.variants[0]
 
     def _variant(self, lens: drt_jax.Lens, values: Array) -> Variant:
@@ -128,14 +131,15 @@ def _sigma(x: Any, y: Any, weights: Any, free: tuple[int, int]) -> Any:
     return sum((share * a**2).sum() for a in away) ** 0.5
 
 
-def _optiland_system(lens: Lens, index: np.ndarray, wavelength: float):
-    """An Optiland lens for one wavelength, um. index: (S + 1,)."""
+def _optiland_system(lens: Lens, index: np.ndarray, wavelength: float, k: int = 0):
+    """An Optiland lens, variant k, for one wavelength, um. index: (S + 1,)."""
     from optiland.materials import IdealMaterial
     from optiland.optic import Optic
 
     optic = Optic()
     optic.surfaces.add(index=0, thickness=lens.distance)
-    for i, (c, gap) in enumerate(zip(lens.curvature, lens.gaps)):
+    curvature, gaps, _ = lens.variants[k]
+    for i, (c, gap) in enumerate(zip(curvature, gaps)):
         medium = "mirror" if lens.mirrors[i] else IdealMaterial(n=float(index[i + 1]))
         kind = {"thickness": gap, "material": medium, "is_stop": i == lens.stop}
         shape = {"radius": 1 / c if c else np.inf, "conic": lens.conic[i]}
@@ -157,8 +161,8 @@ def _optiland_system(lens: Lens, index: np.ndarray, wavelength: float):
     return optic
 
 
-def _optiland_hits(optic: Any, lens: Lens, rays: Rays, wave: int) -> Any:
-    """Traced rays of a wavelength, given by its number."""
+def _optiland_hits(optic: Any, lens: Lens, rays: Rays, wave: int, k: int = 0) -> Any:
+    """Traced rays of a wavelength, given by its number, of variant k."""
     from optiland import backend
     from optiland.rays import RealRays
 
@@ -167,27 +171,28 @@ def _optiland_hits(optic: Any, lens: Lens, rays: Rays, wave: int) -> Any:
         points = types.SimpleNamespace(**dict(zip("xy", map(backend.array, rays.points.T))))
         given = 0, 1 if lens.field else 0, wavelength, None, points
         return optic.trace(*given, record=False)
-    place, along = rays.starts(0, wave)
+    place, along = rays.starts(k, wave)
     one = np.ones(len(place))
     found = RealRays(*place.T, *along.T, one, wavelength * one)
     optic.surfaces.trace(found, record=False)
     return found
 
 
-def optiland_spot(lens: Lens, rays: Rays) -> Callable:
-    """value() -> RMS spot radii sigma (W,), mm, by NumPy."""
+def optiland_spot(lens: Lens, rays: Rays, count: int = 1) -> Callable:
+    """value(k) -> RMS spot radii sigma (W,), mm, by NumPy, of the first `count` variants."""
     from optiland import backend
 
     backend.set_backend("numpy")
-    systems = [_optiland_system(lens, *own) for own in zip(lens.index.T, lens.wavelengths)]
-    for optic in systems:
+    colours = [*zip(lens.index.T, lens.wavelengths)]
+    systems = [[_optiland_system(lens, *own, k) for own in colours] for k in range(count)]
+    for optic in itertools.chain(*systems):
         optic.ray_tracer.set_aiming(rays.aim)
 
-    def value() -> np.ndarray:
+    def value(k: int = 0) -> np.ndarray:
         backend.set_backend("numpy")
         sigma = []
-        for wave, optic in enumerate(systems):
-            found = _optiland_hits(optic, lens, rays, wave)
+        for wave, optic in enumerate(systems[k]):
+            found = _optiland_hits(optic, lens, rays, wave, k)
             light = np.isfinite(found.x) & (found.i > 0)
             some = (a[light] for a in (found.x, found.y, rays.weights))
             sigma.append(_sigma(*some, rays.free))
@@ -293,7 +298,7 @@ def _at_the_pupil(
 
 
 def batoid_spot(lens: Lens, rays: Rays, count: int = 1) -> Callable:
-    """`optiland_spot` by batoid: value(k), of the first `count` variants of the lens."""
+    """`optiland_spot` by batoid."""
     variants = lens.variants[:count]
     optics = [[_batoid_optic(lens, v, index) for index in lens.index.T] for v in variants]
     if rays.aim != "paraxial":
@@ -332,11 +337,24 @@ def batoid_gradient(lens: Lens, rays: Rays) -> Callable:
     return differences(batoid_spot(lens, rays, len(lens.variants)), len(lens.gaps))
 
 
-# (sigma, sigma and gradient) by each program.
+class Spots(NamedTuple):
+    """What a program makes of a `Lens` and `Rays`."""
+
+    sigma: Callable
+    gradient: Callable
+
+
 SPOTS = {
-    "optiland": (optiland_spot, optiland_gradient),
-    "batoid": (batoid_spot, batoid_gradient),
+    "optiland": Spots(optiland_spot, optiland_gradient),
+    "batoid": Spots(batoid_spot, batoid_gradient),
 }
+
+
+def of_all(program: Spots, lens: Lens, rays: Rays) -> Callable:
+    """values() -> sigma of all variants, (V, W)."""
+    count = len(lens.variants)
+    value = program.sigma(lens, rays, count)
+    return lambda: np.array([value(k) for k in range(count)])
 
 
 def batoid_rays(lens: Lens, points: np.ndarray, directions: np.ndarray) -> Callable:

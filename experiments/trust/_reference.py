@@ -25,7 +25,7 @@ from drt_jax.compilation import jit
 from .snell import QUICK, trace_snell
 
 # Distance of the plane of q in front of the first vertex, mm.
-_LEAD = 5.0
+LEAD = 5.0
 _PANELS, _CORNERS, _AZIMUTHS, _RADII = 6, 5, 12, 24
 _BISECTIONS = 50
 # Points along a diameter; half-lines of the search for corners.
@@ -63,19 +63,19 @@ def changed(lens: Lens, values: Array) -> Lens:
     return dataclasses.replace(lens, curvature=curvature, thickness=thickness, sensor=sensor[0])
 
 
-def _trace(lens: Lens, scene: Array, q: Array) -> tuple[Array, Array]:
+def trace(lens: Lens, scene: Array, q: Array) -> tuple[Array, Array]:
     """Hits (S + 1, 2) of the ray through q (2,), mm, and whether it arrives. scene: field,
     1/distance, wavelength."""
     field, vergence, wavelength = scene
-    point = jnp.append(q, -_LEAD)
+    point = jnp.append(q, -LEAD)
     toward = vergence * point + jnp.stack([0 * field, jnp.tan(field), 0 * field + 1])
     hits, ok = trace_snell(lens, wavelength, point, toward / jnp.linalg.norm(toward))
     return hits[:, :2], ok
 
 
-def _excess(lens: Lens, scene: Array, q: Array) -> Array:
+def outside_of(lens: Lens, scene: Array, q: Array) -> Array:
     """r^2 / limit - 1 at the stop and the apertures, (S,); above 0 outside."""
-    hits, ok = _trace(lens, scene, q)
+    hits, ok = trace(lens, scene, q)
     limit2 = lens.semi_diameter[:-1] ** 2
     return jnp.where(ok, jnp.sum(hits[:-1] ** 2, axis=1) / limit2 - 1, 1)
 
@@ -92,16 +92,16 @@ def _bisected(low: Array, high: Array, before: Callable[[Array], Array]) -> tupl
     return jax.lax.fori_loop(0, _BISECTIONS, narrow, (low, high))
 
 
-class _Pupil(NamedTuple):
-    """The region of integration in the plane of q, in polar coordinates about (0, height).
+class Region(NamedTuple):
+    """A region of the plane of q, symmetric about the y axis, in polar coordinates about (0,
+    height).
 
-    scene: field, 1/distance, wavelength.
+    excess: function of q, (2,), by aperture: above 0 outside, as `outside_of`.
     height: (), y of the origin, mm.
     reach: (), radius beyond the region, mm.
     """
 
-    lens: Lens
-    scene: Array
+    excess: Callable[[Array], Array]
     height: Array
     reach: Array
 
@@ -110,48 +110,69 @@ class _Pupil(NamedTuple):
         up = radius * jnp.sin(azimuth) + self.height
         return jnp.stack([radius * jnp.cos(azimuth), up])
 
-    def excess(self, azimuth: Array, radius: Array) -> Array:
-        """`_excess` of the ray through a point."""
-        return _excess(self.lens, self.scene, self.point(azimuth, radius))
-
     def edge(self, azimuth: Array) -> tuple[Array, Array]:
-        """Radius at which a half-line leaves the region, mm, and the surface that limits it."""
+        """Radius at which a half-line leaves the region, mm, and the aperture that limits it."""
+
+        def within(radius):
+            return self.excess(self.point(azimuth, radius))
+
         start = jnp.zeros_like(self.reach)
-        within = partial(self.excess, azimuth)
         low, high = _bisected(start, self.reach, lambda radius: jnp.all(within(radius) <= 0))
         return low, jnp.argmax(within(high))
 
-    def corners(self) -> tuple[Array, Array]:
-        """Azimuth at which the limiting aperture changes, in each of `_SEARCH` - 1 intervals, and
-        whether it does."""
+    def _corners(self) -> tuple[Array, Array]:
+        """Azimuths at which the limiting aperture changes, (_CORNERS,), pi / 2 for none, and their
+        number, which may be larger."""
         azimuth = jnp.linspace(-jnp.pi / 2, jnp.pi / 2, _SEARCH)
         aperture = jax.vmap(self.edge)(azimuth)[1]
+        changes = aperture[:-1] != aperture[1:]
+        (some,) = jnp.nonzero(changes, size=_CORNERS, fill_value=_SEARCH - 2)
 
         def corner(low, high, first):
             return _bisected(low, high, lambda middle: self.edge(middle)[1] == first)[0]
 
-        found = jax.vmap(corner)(azimuth[:-1], azimuth[1:], aperture[:-1])
-        return found, aperture[:-1] != aperture[1:]
+        found = jax.vmap(corner)(azimuth[some], azimuth[some + 1], aperture[some])
+        return jnp.where(changes[some], found, jnp.pi / 2), jnp.sum(changes)
 
-    def line(self, azimuth: Array, varied: Lens) -> tuple[Array, Array]:
-        """Spots (R, 2), mm, and areas (R,) of the nodes of a half-line. The edge follows `varied`,
-        the lens of which derivatives are taken, by one Newton step."""
-        radius, aperture = self.edge(azimuth)
-        slope = jax.jvp(partial(self.excess, azimuth), (radius,), (jnp.ones_like(radius),))[1]
-        pupil = self._replace(lens=varied)
-        edge = radius - pupil.excess(azimuth, radius)[aperture] / slope[aperture]
+    def half_lines(self, nodes: int = _AZIMUTHS) -> tuple[Array, Array, Array]:
+        """Azimuths and widths of Gauss nodes over the half with x > 0, and the number of corners.
+        Panels, of so many nodes, end at the corners; with fewer than `_CORNERS` some are empty."""
+        corners, count = self._corners()
+        even = jnp.linspace(-jnp.pi / 2, jnp.pi / 2, _PANELS + 1)
+        edges = jnp.sort(jnp.concatenate([even, corners]))
+        x, w = np.polynomial.legendre.leggauss(nodes)
+        half = jnp.diff(edges)[:, None] / 2
+        azimuth = (edges[:-1, None] + half * (1 + x)[None]).ravel()
+        return azimuth, (half * w[None]).ravel(), count
 
-        def node(t, weight):
-            def stop_and_sensor(q):
-                hits = _trace(varied, self.scene, q)[0]
-                return hits[varied.stop], hits[-1]
 
-            point = self.point(azimuth, edge * t)
-            jacobian, spot = jax.jacfwd(stop_and_sensor, has_aux=True)(point)
-            return spot, jnp.abs(jnp.linalg.det(jacobian)) * edge**2 * t * weight
+def heights_within(excess: Callable[[Array], Array], reach: Array) -> tuple[Array, Array, Array]:
+    """The least and largest y at which the y axis is in a region, and whether it is anywhere."""
+    heights = jnp.linspace(-reach, reach, _SCAN)
+    diameter = jnp.stack([jnp.zeros_like(heights), heights], axis=1)
+    inside = jnp.all(jax.vmap(excess)(diameter) <= 0, axis=1)
+    low, high = jnp.where(inside, heights, reach), jnp.where(inside, heights, -reach)
+    return jnp.min(low), jnp.max(high), jnp.any(inside)
 
-        t, weight = np.polynomial.legendre.leggauss(_RADII)
-        return jax.vmap(node)(jnp.asarray(1 + t) / 2, jnp.asarray(weight))
+
+def _line(region: Region, azimuth: Array, varied: Lens, scene: Array) -> tuple[Array, Array]:
+    """Spots (R, 2), mm, and areas (R,) of the nodes of a half-line. The edge follows `varied`, the
+    lens of which derivatives are taken, by one Newton step."""
+    radius, aperture = region.edge(azimuth)
+    along = partial(region.point, azimuth)
+    slope = jax.jvp(lambda r: region.excess(along(r)), (radius,), (jnp.ones_like(radius),))[1]
+    edge = radius - outside_of(varied, scene, along(radius))[aperture] / slope[aperture]
+
+    def node(t, weight):
+        def stop_and_sensor(q):
+            hits = trace(varied, scene, q)[0]
+            return hits[varied.stop], hits[-1]
+
+        jacobian, spot = jax.jacfwd(stop_and_sensor, has_aux=True)(along(edge * t))
+        return spot, jnp.abs(jnp.linalg.det(jacobian)) * edge**2 * t * weight
+
+    t, weight = np.polynomial.legendre.leggauss(_RADII)
+    return jax.vmap(node)(jnp.asarray(1 + t) / 2, jnp.asarray(weight))
 
 
 @partial(jit, wanted=QUICK, static_argnames="slopes")
@@ -161,25 +182,14 @@ def _integral(
     """sigma and the height of the centroid, their derivatives (2, P), the number of corners, -1 if
     no ray passes, and whether an aperture other than the stop's limits the beam. part: position of
     the origin along the height of the region, 0 to 1. slopes: as in `reference`."""
-    heights = jnp.linspace(-reach, reach, _SCAN)
-    diameter = jnp.stack([jnp.zeros_like(heights), heights], axis=1)
-    inside = jnp.all(jax.vmap(partial(_excess, lens, scene))(diameter) <= 0, axis=1)
-    low = jnp.min(jnp.where(inside, heights, reach))
-    high = jnp.max(jnp.where(inside, heights, -reach))
-    pupil = _Pupil(lens, scene, low + part * (high - low), reach)
-    # Panels end at the corners; with fewer corners some panels are empty.
-    corners, changes = pupil.corners()
-    corners = jnp.sort(jnp.where(changes, corners, jnp.pi / 2))[:_CORNERS]
-    even = jnp.linspace(-jnp.pi / 2, jnp.pi / 2, _PANELS + 1)
-    edges = jnp.sort(jnp.concatenate([even, corners]))
-    x, w = np.polynomial.legendre.leggauss(_AZIMUTHS)
-    half = jnp.diff(edges)[:, None] / 2
-    azimuth = (edges[:-1, None] + half * (1 + x)[None]).ravel()
-    width = (half * w[None]).ravel()
+    excess = partial(outside_of, lens, scene)
+    low, high, any_light = heights_within(excess, reach)
+    region = Region(excess, low + part * (high - low), reach)
+    azimuth, width, corners = region.half_lines()
 
     def values(parameters):
         varied = changed(lens, parameters)
-        spot, area = jax.vmap(lambda angle: pupil.line(angle, varied))(azimuth)
+        spot, area = jax.vmap(lambda angle: _line(region, angle, varied, scene))(azimuth)
         area = area * width[:, None]
         area = area / jnp.sum(area)
         # The other half is the mirror image in x. A sum of small numbers rounds less.
@@ -194,8 +204,15 @@ def _integral(
         rows, found = jax.jacfwd(values, has_aux=True)(given)
     else:
         rows, found = jnp.full((2, given.size), jnp.nan), values(given)[0]
-    clipped = jnp.any(jax.vmap(pupil.edge)(even)[1] != lens.stop)
-    return found, rows, jnp.where(jnp.any(inside), jnp.sum(changes), -1), clipped
+    clipped = jnp.any(jax.vmap(region.edge)(azimuth[::_AZIMUTHS])[1] != lens.stop)
+    return found, rows, jnp.where(any_light, corners, -1), clipped
+
+
+def beyond(lens: Lens, field: float) -> float:
+    """`reach` of a `Region`, mm."""
+    semi = np.asarray(lens.semi_diameter)
+    # A steep beam crosses the plane far from its hits on the first surface.
+    return (3 * float(np.max(semi[np.isfinite(semi)])) + 2 * LEAD) * (1 + math.tan(abs(field)))
 
 
 def reference(
@@ -208,10 +225,7 @@ def reference(
     wavelengths: wavelengths, um.
     slopes: False to leave out the derivatives, which are NaN then.
     """
-    semi = np.asarray(lens.semi_diameter)
-    # A steep beam crosses the plane far from its hits on the first surface.
-    reach = (3 * float(np.max(semi[np.isfinite(semi)])) + 2 * _LEAD) * (1 + math.tan(abs(field)))
-    rows = []
+    reach, rows = beyond(lens, field), []
     for wavelength in wavelengths:
         scene = jnp.array([field, 1 / distance, wavelength])
         found = [_integral(lens, scene, reach, part, slopes) for part in (0.5, 0.57)]

@@ -74,6 +74,17 @@ def contrast(at: Setting, tolerance: float) -> Any:
     return drt_jax.transfer(at.lens, at.scene, frequencies, sampling=tolerance).otf
 
 
+def strehl(at: Setting, tolerance: float) -> Any:
+    """Strehl ratio (1,)."""
+    return drt_jax.strehl(at.lens, at.scene, tolerance)
+
+
+def energy(at: Setting, tolerance: float) -> Any:
+    """Energy within one, two and four pixels of the centroid."""
+    radii = np.array([1.0, 2.0, 4.0]) * at.pixel
+    return drt_jax.encircled_energy(at.lens, at.scene, radii, sampling=tolerance)
+
+
 def illumination(at: Setting, tolerance: float) -> Any:
     """Relative illumination (1,)."""
     return drt_jax.relative_illumination(at.lens, at.scene, tolerance)
@@ -112,6 +123,8 @@ QUANTITIES = {
     "spot": Quantity(spot, relative, (1e-3, 1e-5, 1e-7, 1e-9), 1e-11),
     "kernel": Quantity(kernel, summed, (1e-1, 3e-2, 1e-2), 1e-3),
     "contrast": Quantity(contrast, largest, (1e-2, 3e-3, 1e-3), 1e-4),
+    "strehl": Quantity(strehl, largest, (1e-2, 3e-3, 1e-3), 1e-4),
+    "energy": Quantity(energy, largest, (1e-2, 3e-3, 1e-3), 1e-4),
     "illumination": Quantity(illumination, largest, (1e-2, 1e-4, 1e-6), 1e-10),
     "photograph": Quantity(photograph, rms, (1e-2, 3e-3), 3e-4),
 }

@@ -8,10 +8,20 @@ import numpy as np
 import pytest
 from experiments._reference import changed, reference
 from experiments.snell import trace_snell
+from scipy import special
 
 import drt_jax
 from drt_jax import Scene
-from experiments import _common, _curves, _peers, _profile, _work, benchmark
+from experiments import (
+    _common,
+    _curves,
+    _peers,
+    _profile,
+    _wave_reference as wave,
+    _waves,
+    _work,
+    benchmark,
+)
 from experiments.runs.config import ConfigError
 from experiments.runs.machine import machine
 
@@ -127,23 +137,69 @@ def test_our_nodes_through_another_tracer_come_to_the_reference(monkeypatch):
         x, y = np.asarray(hits[:, -1, :2]).T
         return np.array([_peers._sigma(x, y, rays.weights, rays.free)])
 
-    def snell(numbers, rays):
-        return lambda: value(rays, 0)
+    def snell(numbers, rays, count=1):
+        return lambda k=0: value(rays, k)
 
     def slopes(numbers, rays):
         return _peers.differences(partial(value, rays), lens.count)
 
     monkeypatch.setattr(_work, "version", lambda name: "1")
-    monkeypatch.setattr(_peers, "SPOTS", {"snell": (snell, slopes)})
+    monkeypatch.setattr(_peers, "SPOTS", {"snell": _peers.Spots(snell, slopes)})
     scene, truth = Scene.point(field, np.inf, (0.55,)), reference(*given)
     curved = dataclasses.replace(lens, curved=(lens.stop,))
-    nodes = [(name, of) for name, of in _curves.ways(curved, scene, (), (3, 8)) if "our" in name]
+    every = _curves.ways(curved, scene, (), (3, 8), values := _peers.shifted(curved))
+    nodes = [(name, of) for name, of in every if "our" in name]
     numbers = _peers.Lens(*given)
     error = partial(benchmark.spot_error, truth, lens.count)
-    tries, notes = _curves.peers(numbers, nodes, error, False)
+    tries, notes = _curves.peers(numbers, nodes, error, lambda spots, *given: spots.sigma(*given))
     assert not notes
     coarse, fine = tries
     assert fine.program == "snell 1, launched by us" and fine.size == 8 * 9
     assert fine.error < 1e-11 < coarse.error < 1e-2
-    (moved,), _ = _curves.peers(numbers, nodes[1:], lambda found: error(*found), True)
+    (moved,), _ = _curves.peers(
+        numbers, nodes[1:], lambda found: error(*found), lambda spots, *own: spots.gradient(*own)
+    )
     assert 1e-11 < moved.error < 1e-5
+
+    # All variants, as a run of tolerances asks for them.
+    some = [reference(changed(lens, row), *given[1:], slopes=False) for row in values[:3]]
+
+    def worst(found):
+        return max(abs(s[0] / t.sigma[0] - 1) for s, t in zip(found, some))
+
+    (many,), _ = _curves.peers(numbers, nodes[1:], worst, _peers.of_all)
+    assert many.error < 1e-11
+
+
+FREQUENCIES = np.array([20.0, 60.0, 200.0])
+
+
+@pytest.mark.slow
+def test_the_reference_of_waves_is_the_closed_form_of_a_perfect_lens():
+    """A paraboloid of f/10, on its axis: contrast of a round pupil, and the Airy pattern."""
+    stop = {"radius": np.inf, "thickness": 60, "glass": "air", "semi_diameter": 5, "stop": True}
+    mirror = {"radius": -200, "conic": -1, "mirror": True, "semi_diameter": 6}
+    lens = drt_jax.load_lens({"surfaces": [stop, mirror], "sensor": -40})
+    wavelength = 0.5
+    found, change = wave.transfer(lens, 0.0, wavelength, FREQUENCIES)
+    part = FREQUENCIES * wavelength * 1e-3 * 10
+    exact = 2 / np.pi * (np.arccos(part) - part * np.sqrt(1 - part**2))
+    assert change < 1e-9
+    np.testing.assert_allclose(found, [exact, exact], atol=2e-4)  # sines for tangents
+    radii = 1e-3 * np.array([1e-3, 2.0, 6.1, 8.0])
+    light, change = wave.image(lens, 0.0, wavelength, np.stack([0 * radii, radii], axis=1))
+    v = np.pi * radii / (wavelength * 1e-3 * 10)
+    airy = np.pi / 4 / (wavelength * 1e-3 * 10) ** 2 * (2 * special.j1(v) / v) ** 2
+    assert change < 1e-9
+    np.testing.assert_allclose(light, airy, atol=3e-3 * airy[0])
+
+
+@pytest.mark.slow
+def test_the_reference_of_waves_agrees_with_the_library_off_axis():
+    lens, field = drt_jax.load_lens("cooke_triplet"), np.radians(14)
+    at = _waves.view(lens, field, 0.55, _waves.Waves(size=9))
+    scene = Scene.point(field, np.inf, (0.55,))
+    mtf, change = wave.transfer(at.lens, field, 0.55, FREQUENCIES)
+    own = drt_jax.transfer(at.lens, scene, FREQUENCIES, sampling=1e-5).mtf
+    assert change < 1e-9
+    np.testing.assert_allclose(own, mtf, atol=1e-5)
