@@ -112,8 +112,8 @@ def _turned(of: _Light, q: Array, by: Array) -> tuple[Array, Array]:
 
 @partial(jit, wanted=QUICK)
 def _overlap(of: _Light, reach: Array, shear: Array, part: float) -> tuple[Array, Array]:
-    """The integrals (2,) of P conj(P) of pupils that differ by `shear`, (2,), along one axis; and
-    the number of corners. part: as in `_reference`."""
+    """The integrals of P conj(P) of pupils that differ by `shear`, (2,), along one axis, (2, 2),
+    [real and imaginary, light]; and the number of corners. part: as in `_reference`."""
 
     def ends(q):
         return [_turned(of, q, by) for by in (shear / 2, -shear / 2)]
@@ -140,14 +140,16 @@ def _overlap(of: _Light, reach: Array, shear: Array, part: float) -> tuple[Array
             first, second = (_wave(of, place) for place, _ in ends(q))
             light = jnp.sqrt(first.light / first.spread * second.light / second.spread)
             area = _wave(of, q).spread * radius**2 * t * weight
-            return area * light * jnp.exp(1j * (phase(first) - phase(second)))
+            turn = phase(first) - phase(second)
+            return area * jnp.stack([jnp.cos(turn), jnp.sin(turn)])[:, None] * light[None]
 
         t, weight = np.polynomial.legendre.leggauss(_RADII)
         return jnp.sum(jax.vmap(node)(jnp.asarray(1 + t) / 2, jnp.asarray(weight)), axis=0)
 
-    half = width @ jax.vmap(line)(azimuth)
-    # In the mirror image in x a shear along x changes its sign.
-    return half + jnp.where(shear[0] == 0, half, jnp.conj(half)), corners
+    half = jnp.tensordot(width, jax.vmap(line)(azimuth), 1)
+    # In the mirror image in x a shear along x changes its sign, and the integral is conjugated.
+    both = jnp.stack([jnp.ones_like(reach), jnp.where(shear[0] == 0, 1.0, 0.0)])
+    return 2 * half * both[:, None], corners
 
 
 @partial(jit, wanted=QUICK)
@@ -195,9 +197,9 @@ def transfer(
     shears = [f * wavelength / _UM * np.eye(2)[axis] for axis in (1, 0) for f in frequencies]
     found = []
     for part in (0.5, 0.57):
-        light, _ = _overlap(of, reach, jnp.zeros(2), part)
-        values = [_overlap(of, reach, jnp.asarray(s), part)[0] / light for s in shears]
-        found.append(np.abs(np.array(values)).T.reshape(2, 2, -1))
+        light = np.asarray(_overlap(of, reach, jnp.zeros(2), part)[0][0])
+        waves = [np.asarray(_overlap(of, reach, jnp.asarray(s), part)[0]) for s in shears]
+        found.append(np.array([np.hypot(*wave) / light for wave in waves]).T.reshape(2, 2, -1))
     return found[0], float(np.max(np.abs(found[0] - found[1])))
 
 

@@ -185,13 +185,13 @@ def test_the_reference_of_waves_is_the_closed_form_of_a_perfect_lens():
     part = FREQUENCIES * wavelength * 1e-3 * 10
     exact = 2 / np.pi * (np.arccos(part) - part * np.sqrt(1 - part**2))
     assert change < 1e-9
-    np.testing.assert_allclose(found, [exact, exact], atol=2e-4)  # sines for tangents
+    np.testing.assert_allclose(found, [[exact, exact]] * 2, atol=2e-4)  # sines for tangents
     radii = 1e-3 * np.array([1e-3, 2.0, 6.1, 8.0])
     light, change = wave.image(lens, 0.0, wavelength, np.stack([0 * radii, radii], axis=1))
     v = np.pi * radii / (wavelength * 1e-3 * 10)
     airy = np.pi / 4 / (wavelength * 1e-3 * 10) ** 2 * (2 * special.j1(v) / v) ** 2
     assert change < 1e-9
-    np.testing.assert_allclose(light, airy, atol=3e-3 * airy[0])
+    np.testing.assert_allclose(light, [airy] * 2, atol=3e-3 * airy[0])
 
 
 @pytest.mark.slow
@@ -202,4 +202,5 @@ def test_the_reference_of_waves_agrees_with_the_library_off_axis():
     mtf, change = wave.transfer(at.lens, field, 0.55, FREQUENCIES)
     own = drt_jax.transfer(at.lens, scene, FREQUENCIES, sampling=1e-5).mtf
     assert change < 1e-9
-    np.testing.assert_allclose(own, mtf, atol=1e-5)
+    np.testing.assert_allclose(own, mtf[0], atol=1e-5)  # light that fills the stop evenly
+    assert 1e-5 < np.max(np.abs(own - mtf[1])) < 1e-2
