@@ -45,14 +45,14 @@ def nearest(vector: Array, metric: Array, rows: Array, most: Array) -> Array:
     back = jnp.linalg.solve(metric, rows.T)
     size = safe_sqrt(jnp.diagonal(matmul(rows, back)))
     unit = safe_divide(jnp.ones_like(size), size)  # 0 for a row of zeros
-    back, over = back * unit, (matmul(rows, vector) - most) * unit
+    back, over = back * unit[None], (matmul(rows, vector) - most) * unit
     square = matmul(rows, back) * unit[:, None]
     count, one = len(most), jnp.eye(len(most), dtype=vector.dtype)
     tiny = jnp.finfo(vector.dtype).eps * one  # parts rows that are parallel
 
     def turn(state: tuple) -> tuple:
         push, active, _, turns = state
-        both = active[:, None] & active
+        both = active[:, None] & active[None]
         wanted = jnp.linalg.solve(jnp.where(both, square, one) + tiny, jnp.where(active, over, 0))
         fits = jnp.all(~active | (wanted > 0))
         left = jnp.where(active, -jnp.inf, over - matmul(square, wanted))
