@@ -96,7 +96,7 @@ def error_curves(
 
 
 def programs(axes: Axes, curves: Mapping[tuple[str, str], Sequence[dict]], title: str) -> None:
-    """Relative error over time of a call, both logarithmic, with bars from the first to the third
+    """Error over time of a call, both logarithmic, with bars from the first to the third
     quartile. The first program has a thick line; each of the others a colour of its own.
 
     curves: rows with `quartiles_s` and `error`, by program and sampling.
@@ -110,7 +110,7 @@ def programs(axes: Axes, curves: Mapping[tuple[str, str], Sequence[dict]], title
         bars = np.stack([middle - low, high - middle])
         axes.errorbar(middle, errors, xerr=bars, label=f"{program}: {sampling}", **style)
     axes.set(xscale="log", yscale="log", title=title)
-    label_axes(axes, "time of a call (ms)", "error, relative", fontsize=7, loc="upper center",
+    label_axes(axes, "time of a call (ms)", "error", fontsize=7, loc="upper center",
                bbox_to_anchor=(0.5, -0.14), ncols=2)  # fmt: skip
 
 

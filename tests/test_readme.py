@@ -45,6 +45,12 @@ def test_lens_of_your_own_loads(tmp_path):
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_experiments_exist(page):
+    for name in re.findall(r"experiments\.([a-z]\w*)", page.read_text()):
+        assert name == "tables" or (ROOT / "configs" / f"{name}.yaml").exists(), name
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 def test_links_exist(page):
     for target in re.findall(r"\]\(([^)#:]+)\)", page.read_text()):
         assert (page.parent / target).exists(), target

@@ -95,6 +95,7 @@ class RaySteps:
         bias = [1 - b ** (state.steps + 1).astype(vector.dtype) for b in (self.b1, self.b2)]
         length = safe_sqrt(second / bias[1])
         unit = safe_divide(jnp.linalg.solve(metric, first) / bias[0], length)
-        size = self.size(state.steps) if callable(self.size) else self.size
+        k = state.steps.astype(vector.dtype)
+        size = self.size(k) if callable(self.size) else self.size
         new = within_limits(self.limits, vector, vector - size * unit, metric)
         return new, RayState(state.steps + 1, first, second, metric)

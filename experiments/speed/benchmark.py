@@ -359,23 +359,19 @@ def tables(results: dict[str, Any]) -> dict[str, str]:
         before = row["task"]
     header = "work", "drt_jax", "error", "to compile", "peer", "its time", "error", "ratio"
     counts = "what a training step trains", "solves for rays"
-    found = {}
-    if "curves" in results:  # not in results of releases before
-        machine = [(_common.one_machine(results),)]
-        found["benchmark, machine"] = _common.table(("machine of this run",), machine)
-        found["benchmark, curves"] = _curves.summary(results["curves"])
-    if results.get("profile"):
-        found["benchmark, profile"] = _profile.summary(results["profile"])
-        found["benchmark, unsolved"] = _profile.reasons(results["profile"])
+    machine = [(_common.one_machine(results),)]
     rates = [
         (row["task"], *(f"{row[key] / 1e6:.3g}" if row[key] else "" for key in RATES))
         for row in results["rows"]
         if "ours_surfaces_per_s" in row
     ]
-    if rates:
-        header_of_rates = "work", "drt_jax, 1e6 rays x surfaces / s", "batoid"
-        found["benchmark, rates"] = _common.table(header_of_rates, rates)
-    return found | {
+    header_of_rates = "work", "drt_jax, 1e6 rays x surfaces / s", "batoid"
+    return {
+        "benchmark, machine": _common.table(("machine of this run",), machine),
+        "benchmark, curves": _curves.summary(results["curves"]),
+        "benchmark, profile": _profile.summary(results["profile"]),
+        "benchmark, unsolved": _profile.reasons(results["profile"]),
+        "benchmark, rates": _common.table(header_of_rates, rates),
         "benchmark": _common.table(header, lines),
         "benchmark, counts": _common.table(counts, results["counts"].items()),
     }

@@ -221,6 +221,20 @@ def test_tables_of_the_pages_are_those_of_the_results():
         tables.filled("<!-- table: none -->\n<!-- end -->", found)
 
 
+def test_every_row_of_evidence_is_made_by_a_command():
+    """No table there is written by hand."""
+    text = (_common.ROOT / "docs" / "evidence.md").read_text()
+    left = tables._BLOCK.sub("", text)
+    assert "<!-- table: benchmark, curves -->" in text
+    assert not [line for line in left.splitlines() if line.startswith("|")]
+
+
+def test_tables_of_a_gpu_stay_empty_until_they_are_measured():
+    text = "<!-- table: gpu: benchmark -->\n*not measured*\n<!-- end -->"
+    assert tables.filled(text, {}) == text
+    assert "| 1 |" in tables.filled(text, {"gpu: benchmark": "| 1 |"})
+
+
 def test_a_table_can_be_read_as_text():
     text = _common.table(("a", "bc"), [(1, 0.123456), ("long", None)])
     assert text.splitlines() == [
