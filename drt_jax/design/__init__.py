@@ -20,6 +20,7 @@ from .problem import (
     open_apertures as open_apertures,
     trace_fields as trace_fields,
 )
+from .ray_steps import RaySteps as RaySteps, cosine as cosine
 from .solves import Solve as Solve
 from .starts import (
     Minimum as Minimum,

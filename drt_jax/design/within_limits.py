@@ -6,13 +6,15 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from ..numerics import matmul
+from ..numerics import matmul, safe_divide, safe_sqrt
 from .problem import Problem, quick
 
 # A limit with a violation up to this counts as met, in the units of `Evaluation.constraints`.
 _MET = 1e-4
 # Largest number of projections; the number of further evaluations, which halve the step.
 _ROUNDS, _HALVINGS = 3, 6
+# Of `nearest`: a row counts as met up to this part of the largest multiplier; turns for each row.
+_EXACT, _TURNS = 1e-9, 5
 
 
 class _State(NamedTuple):
@@ -30,35 +32,83 @@ class _State(NamedTuple):
     done: Array
 
 
-def within_limits(problem: Problem, before: Array, after: Array) -> Array:
+def nearest(vector: Array, metric: Array, rows: Array, most: Array) -> Array:
+    """The x nearest to a vector v with rows @ x <= most: of least (x - v)^T metric (x - v).
+
+    With u >= 0, one multiplier for each row, x = v - metric^-1 rows^T u, and u is least squares
+    with the normal matrix G = rows metric^-1 rows^T: solved for a set of rows that grows by the row
+    that is violated most, and shrinks where a multiplier would become negative (Lawson and Hanson,
+    Solving Least Squares Problems, 1974, ch. 23), which always ends.
+
+    vector: (N,). metric: (N, N), positive definite. rows: (L, N). most: (L,); inf for no limit.
+    """
+    back = jnp.linalg.solve(metric, rows.T)
+    size = safe_sqrt(jnp.diagonal(matmul(rows, back)))
+    unit = safe_divide(jnp.ones_like(size), size)  # 0 for a row of zeros
+    back, over = back * unit[None], (matmul(rows, vector) - most) * unit
+    square = matmul(rows, back) * unit[:, None]
+    count, one = len(most), jnp.eye(len(most), dtype=vector.dtype)
+    tiny = jnp.finfo(vector.dtype).eps * one  # parts rows that are parallel
+
+    def turn(state: tuple) -> tuple:
+        push, active, _, turns = state
+        both = active[:, None] & active[None]
+        wanted = jnp.linalg.solve(jnp.where(both, square, one) + tiny, jnp.where(active, over, 0))
+        fits = jnp.all(~active | (wanted > 0))
+        left = jnp.where(active, -jnp.inf, over - matmul(square, wanted))
+        worst = jnp.argmax(left)
+        ends = fits & (left[worst] <= _EXACT * jnp.max(jnp.abs(wanted), initial=0.0))
+        # As far as no multiplier becomes negative; that of the row that stops it becomes 0.
+        part = jnp.where(active & (wanted <= 0), safe_divide(push, push - wanted), 1.0)
+        some = push + jnp.min(part) * (wanted - push)
+        kept = active & (jnp.arange(count) != jnp.argmin(part)) & (some > 0)
+        grown = active | (jnp.arange(count) == worst)
+        new = jnp.where(fits, wanted, jnp.where(kept, some, 0))
+        return new, jnp.where(fits, jnp.where(ends, active, grown), kept), ends, turns + 1
+
+    start = jnp.zeros_like(most), jnp.zeros(count, bool), jnp.bool_(False), 0
+    goes_on = lambda state: ~state[2] & (state[3] < _TURNS * count)  # noqa: E731
+    push = jax.lax.while_loop(goes_on, turn, start)[0]
+    return vector - matmul(back, push)
+
+
+def within_limits(
+    problem: Problem, before: Array, after: Array, metric: Array | None = None
+) -> Array:
     """The vector with which an optimiser continues: `after`, changed as little as needed.
 
-    Bounds are clipped. A vector is allowed if its largest violation of a limit is at most 1e-4 or
-    that of `before`, if surfaces overlap by no more than at `before`, and if no more rays fail. (A
-    number that is not finite counts as an infinite overlap.) While `after` violates a limit, up to
-    three Newton steps of least length project it onto the violated limits: with their violations c
-    and the Jacobian J of c, a step is -J^T (J J^T)^-1 c. If the vector is still not allowed, a
-    backtracking line search halves its step from `before`. If none of nine vectors is allowed, the
-    result is `before`. So the lens does not get worse even if limits cannot be met. Works in `jit`.
+    A vector is allowed if its largest violation of a limit is at most 1e-4 or that of `before`, if
+    surfaces overlap by no more than at `before`, and if no more rays fail. (A number that is not
+    finite counts as an infinite overlap.) While the vector nearest to `after` within the bounds
+    violates a limit, up to three rounds take the one nearest to `after` within the bounds and the
+    limits, linear about the last vector. If it is still not allowed, a backtracking line search
+    halves its step from `before`. If none of nine vectors is allowed, the result is `before`. So
+    the lens does not get worse even if limits cannot be met. Works in `jit`.
 
     problem: its bounds and limits count, its merit does not.
     before, after: (N,), vectors before and after an update.
+    metric: (N, N), positive definite: a change d is as long as d^T metric d says. None: d^T d, in
+        the units of the variables. A step that moves many numbers which compensate each other needs
+        the metric that it was measured in, see `RaySteps`.
 
     Returns (N,).
     """
     problem = quick(problem)
     low, high = problem.variables.low, problem.variables.high
-    after = jnp.clip(jnp.where(jnp.isfinite(after), after, before), low, high)
+    after = jnp.where(jnp.isfinite(after), after, before)
+    one = jnp.eye(len(after), dtype=after.dtype)
+    bounds, ends = jnp.concatenate([one, -one]), jnp.concatenate([high, -low])
+    if metric is None:
+        wanted, metric = jnp.clip(after, low, high), one
+    else:
+        wanted = nearest(after, metric, bounds, ends)
 
     def projected(vector: Array, violations: Array) -> Array:
-        """One Newton step of least length onto the violated limits, within the bounds."""
+        """The vector nearest to `after` within bounds and limits, linear about `vector`."""
         slopes = jax.jacfwd(lambda v: problem.evaluate(v).constraints)(vector)
-        slopes = jnp.where((violations > 0)[:, None], slopes, 0)
-        square = matmul(slopes, slopes.T)
-        tiny = jnp.finfo(vector.dtype).eps * (1 + jnp.trace(square))
-        square = square + tiny * jnp.eye(len(violations), dtype=vector.dtype)
-        step = matmul(slopes.T, jnp.linalg.solve(square, jnp.maximum(violations, 0)))
-        return jnp.clip(vector - jnp.where(jnp.isfinite(step), step, 0), low, high)
+        most = jnp.concatenate([matmul(slopes, vector) - violations, ends])
+        found = nearest(after, metric, jnp.concatenate([slopes, bounds]), most)
+        return jnp.clip(jnp.where(jnp.isfinite(found), found, vector), low, high)
 
     def next_state(state: _State) -> _State:
         """Evaluates a vector, and chooses the next one if it is not allowed."""
@@ -72,7 +122,7 @@ def within_limits(problem: Problem, before: Array, after: Array) -> Array:
         )
         projects = (state.tried <= _ROUNDS) & (most > 0) & ~is_first
         halfway = jnp.where(state.tried < _ROUNDS + _HALVINGS, (before + state.vector) / 2, before)
-        new = jnp.where(is_first, after, halfway)
+        new = jnp.where(is_first, wanted, halfway)
         if found.constraints.size:
             violations = found.constraints
             new = jax.lax.cond(projects, projected, lambda v, _: new, state.vector, violations)

@@ -1,7 +1,7 @@
 """Lens and network trained together over the field and over depth.
 
 The kernels of object points, which are drawn anew in each step, go through the sensor layer and the
-network. There are two optimisers of the lens.
+network.
 """
 
 import dataclasses
@@ -13,6 +13,7 @@ import jax.numpy as jnp
 from jax import Array
 from jax.flatten_util import ravel_pytree
 
+from ..design.ray_steps import RaySteps
 from ..image.sensor import convolve_each
 from ..inputs import require
 from ..numerics import Numbers
@@ -135,6 +136,33 @@ def draw_points(key: Array, count: int, field: float, depths: tuple[float, float
     return ObjectPoints(jnp.arctan(tangents), distances)
 
 
+class _Adam(NamedTuple):
+    """Adam on all numbers of the optics, kept within what can be built. rates: see `adam`."""
+
+    rates: Any
+    hold: Hold
+
+    def init(self, optics: Any) -> Any:
+        return adam({"optics": self.rates})[0]({"optics": optics})
+
+    def update(self, gradient: Any, state: Any, optics: Any) -> tuple[Any, Any]:
+        updates, state = adam({"optics": self.rates})[1]({"optics": gradient}, state)
+        return self.hold(optics, apply_updates(optics, updates["optics"])), state
+
+
+class _OfLens(NamedTuple):
+    """Steps of the vector "lens" of the optics, which keep its limits themselves."""
+
+    steps: RaySteps
+
+    def init(self, optics: Any) -> Any:
+        return self.steps.init(optics["lens"])
+
+    def update(self, gradient: Any, state: Any, optics: Any) -> tuple[Any, Any]:
+        vector, state = self.steps.update(gradient["lens"], state, optics["lens"])
+        return optics | {"lens": vector}, state
+
+
 def make_field_step(
     imager: FieldImager,
     rates: dict[str, Any],
@@ -142,26 +170,29 @@ def make_field_step(
     seed: int,
     hold: Hold = lambda before, after: after,
 ) -> tuple[Callable, Callable]:
-    """Adam on the mean absolute error, for lens and network, as (init, step) for `fit`.
+    """A step of lens and network on the mean absolute error, as (init, step) for `fit`.
 
     imager: the camera.
-    rates: learning rates of "optics" and "network", see `adam`.
+    rates: of "network", Adam's learning rates, see `adam`; of "optics", the same, or
+        `design.RaySteps` for optics {"lens": vector of the variables}.
     draw: function that returns the object points of a step from a PRNG key, for instance by
         `draw_points`.
     seed: points and noise depend only on it and on the index of the step.
-    hold: keeps the optics within what can be built, see `design.within_limits`.
+    hold: keeps the optics of Adam within what can be built, see `design.within_limits`.
 
     init(parameters) -> state; step(state, scenes, noise, index) -> (state, metrics), jitted, with
     the state donated. metrics: loss, (). Parameters without "network" train the optics alone.
     """
-    init_adam, update = adam(rates)
+    init_adam, update = adam(_weights(rates))
+    of = rates["optics"]
+    optics = _OfLens(of) if isinstance(of, RaySteps) else _Adam(of, hold)
 
-    def init(parameters: dict[str, Any]) -> tuple[Any, Any]:
+    def init(parameters: dict[str, Any]) -> tuple[Any, Any, Any]:
         parameters = copied(parameters)
-        return parameters, init_adam(parameters)
+        return parameters, init_adam(_weights(parameters)), optics.init(parameters["optics"])
 
-    def step(state: tuple[Any, Any], scenes: Array, noise: Array, index: Array):
-        parameters, moments = state
+    def step(state: tuple[Any, Any, Any], scenes: Array, noise: Array, index: Array):
+        parameters, moments, means = state
         seen, noise_key = _drawn(draw, seed, index)
 
         def loss(parameters):
@@ -169,10 +200,10 @@ def make_field_step(
             return jnp.mean(jnp.abs(restored - truth))
 
         error, gradients = jax.value_and_grad(loss)(parameters)
-        updates, moments = update(gradients, moments)
-        new = apply_updates(parameters, updates)
-        new["optics"] = hold(parameters["optics"], new["optics"])
-        return (new, moments), {"loss": error}
+        updates, moments = update(_weights(gradients), moments)
+        new = apply_updates(_weights(parameters), updates)
+        new["optics"], means = optics.update(gradients["optics"], means, parameters["optics"])
+        return (new, moments, means), {"loss": error}
 
     return init, compiled_step(step)
 

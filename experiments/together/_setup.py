@@ -46,7 +46,7 @@ class Arm(NamedTuple):
     title: its name in tables and figures.
     begins: lens at the start: "spoilt", or finished by least squares on "spots" or "mtf".
     moves: what training changes of the lens: "all" variables, the "sensor", or "nothing".
-    damped: True for least-squares steps of the lens instead of Adam's.
+    steps: of the lens: "adam", "rays" (`design.RaySteps`) or "damped" (least squares on pixels).
     frozen: True for the network that the arm `spots` has trained, which stays.
     as_built: True for a lens with errors of its own in each step.
     """
@@ -54,7 +54,7 @@ class Arm(NamedTuple):
     title: str
     begins: str
     moves: str = "all"
-    damped: bool = False
+    steps: str = "adam"
     frozen: bool = False
     as_built: bool = False
 
@@ -66,7 +66,9 @@ ARMS = {
     "joint": Arm("(d) jointly from the spoilt lens", "spoilt"),
     "joint_from_spots": Arm("(e) jointly from (b)", "spots"),
     "frozen": Arm("(f) lens of (b) through its frozen network", "spots", frozen=True),
-    "damped": Arm("(d) with least-squares steps of the lens", "spoilt", damped=True),
+    "damped": Arm("(d) with least-squares steps of the lens", "spoilt", steps="damped"),
+    "rays": Arm("(d) with steps of rays", "spoilt", steps="rays"),
+    "rays_from_spots": Arm("(e) with steps of rays", "spots", steps="rays"),
     "tolerant": Arm("(e) with lenses as built", "spots", as_built=True),
 }
 
@@ -220,19 +222,22 @@ class Setup:
 
     def step(self, arm: Arm) -> tuple[Callable, Callable]:
         """(init, step) of an arm; arms that differ in numbers alone share a program."""
-        kind = arm.moves == "nothing", arm.damped, arm.frozen, arm.as_built
+        kind = arm.moves == "nothing", arm.steps, arm.frozen, arm.as_built
         if kind not in self._steps:
             self._steps[kind] = self._step(*kind)
         return self._steps[kind]
 
     def _step(
-        self, stays: bool, damped: bool, frozen: bool, as_built: bool
+        self, stays: bool, steps: str, frozen: bool, as_built: bool
     ) -> tuple[Callable, Callable]:
         """(init, step); stays: True for a lens that stays, the others as in `Arm`."""
         setting, restore = self.config.train, shared(self.restore, self.mesh, 1)
         rates: dict[str, Any] = {"network": setting.network_rate, "optics": 0.0}
-        if damped:
+        if steps == "damped":
             rates["optics"] = setting.damped_rate
+        elif steps == "rays":
+            size = design.cosine(1e-3 * setting.rays_um, setting.batches)
+            rates["optics"] = design.RaySteps(self.spots, self.limits, size)
         elif not stays:
             rates["optics"] = {"lens": self.rates, "moves": 0.0}
 
@@ -258,13 +263,14 @@ class Setup:
             return before | {"lens": design.within_limits(self.limits, before["lens"], vector)}
 
         imager = FieldImager(points, restored, shared(learn.convolve_each, self.mesh))
-        return (make_damped_step if damped else make_field_step)(imager, rates, draw, 0, hold)
+        make = make_damped_step if steps == "damped" else make_field_step
+        return make(imager, rates, draw, 0, hold)
 
     def start(self, arm: Arm, seed: int, vector: Array, weights: Any) -> dict[str, Any]:
         """The parameters of an arm at the start, from the vector of its lens and, for a frozen
         network, its weights."""
         optics = {"lens": vector}
-        if not arm.damped:
+        if arm.steps == "adam":
             moves = [arm.moves != "sensor" or name == "sensor" for name in self.variables.names]
             optics["moves"] = jnp.asarray(np.array(moves, float))
         network = weights if arm.frozen else self.init(jax.random.key(seed))

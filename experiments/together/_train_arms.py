@@ -94,7 +94,7 @@ def _train(
     a step."""
     setting, job = setup.config.train, f"{arm} {seed}"
     total = setting.batches
-    if ARMS[arm].damped:
+    if ARMS[arm].steps == "damped":
         total = max(1, round(setting.damped_part * total))
     init, same = setup.step(ARMS[arm])
     # Points and noise of their own for each seed, by one program.

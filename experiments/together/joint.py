@@ -1,11 +1,12 @@
 """Design a lens and its network together, over field and depth, against a finished lens.
 
 All arms begin with the same spoilt lens: `focus` trains its sensor and the network; `spots` and
-`mtf` finish the lens by least squares, then train the network; `joint` trains all variables and
-the network from the spoilt lens, `joint_from_spots` from the finished one; `damped` is `joint`
-with least-squares steps of the lens; `frozen` trains the lens of `spots` through its network;
-`tolerant` is `joint_from_spots` with lenses as built. Every arm has the same data, steps and
-starts of the network. Another model of the picture judges them: waves, more fields, more
+`mtf` finish the lens by least squares, then train the network; `joint` trains all variables and the
+network from the spoilt lens, `joint_from_spots` from the finished one; `damped` is `joint` with
+least-squares steps of the lens on pixels, `rays` and `rays_from_spots` are `joint` and
+`joint_from_spots` with steps that are measured by rays; `frozen` trains the lens of `spots` through
+its network; `tolerant` is `joint_from_spots` with lenses as built. Every arm has the same data,
+steps and starts of the network. Another model of the picture judges them: waves, more fields, more
 wavelengths, images that no arm has seen. Writes lenses/ARM SEED.yaml.
 """
 
@@ -58,6 +59,8 @@ class Training:
 
     points: object points of a step, which share the batch.
     optics_rate: Adam's rate of each variable, as the change of the spots by a step, um.
+    rays_um: by how far the first steps of `rays` move the rays, root mean square, um; they become
+        shorter as a cosine.
     damped_rate: part of a full least-squares step that `damped` takes.
     damped_part: part of the batches that `damped` gets, for equal time.
     """
@@ -67,6 +70,7 @@ class Training:
     patch: Annotated[int, within(7, 4096)] = 32
     points: Annotated[int, within(1, 4096)] = 4
     optics_rate: Annotated[float, within(0, 10)] = 0.1
+    rays_um: Annotated[float, within(0, 1e3)] = 1.0
     damped_rate: Annotated[float, within(0, 10)] = 0.1
     damped_part: Annotated[float, within(1e-3, 10)] = 1.0
     network_rate: Annotated[float, within(0, 10)] = 1e-3

@@ -134,7 +134,7 @@ def test_the_loss_has_the_derivative_of_finite_differences_by_every_kind_of_numb
 
 
 @pytest.mark.slow
-def test_both_optimisers_descend_within_what_holds_the_lens(camera):
+def test_all_optimisers_descend_within_what_holds_the_lens(camera):
     variables, imager, weights = camera
     start = variables.start.at[-1].add(6.0)  # 0.3 mm out of focus
 
@@ -142,8 +142,12 @@ def test_both_optimisers_descend_within_what_holds_the_lens(camera):
         return {"lens": jnp.clip(after["lens"], start - 5, start + 5)}
 
     focus = 0.3 * jnp.asarray([name == "sensor" for name in variables.names], start.dtype)
+    scene = Scene.radians(SEEN.fields, np.inf, WAVES)
+    spots = design.Problem.from_variables(variables, ["spot"], scene, 4)
+    rays = design.RaySteps(spots, spots, design.cosine(5e-3, 25))
     first = []
-    for make, rate in ((make_field_step, {"lens": focus}), (make_damped_step, 0.3)):
+    ways = (make_field_step, {"lens": focus}), (make_field_step, rays), (make_damped_step, 0.3)
+    for make, rate in ways:
         rates = {"optics": rate, "network": 1e-3}
         init, step = make(imager, rates, lambda key: SEEN, 0, hold)
         state, losses = init({"optics": {"lens": start}, "network": weights}), []
@@ -153,8 +157,8 @@ def test_both_optimisers_descend_within_what_holds_the_lens(camera):
         moved = np.asarray(state[0]["optics"]["lens"] - start)
         first.append(losses[0])
         assert losses[-1] < 0.8 * losses[0], make
-        assert np.max(np.abs(moved)) <= 5
-        if make is make_field_step:
+        assert np.max(np.abs(moved)) <= 5 or rate is rays  # which keeps limits of its own
+        if isinstance(rate, dict):
             assert moved[-1] < -0.5
             assert not moved[:-1].any()
-    assert first[0] == pytest.approx(first[1], rel=1e-5)
+    assert first == pytest.approx([first[0]] * 3, rel=1e-5)

@@ -1,0 +1,101 @@
+"""Steps of a lens that are measured by how far they move its rays.
+
+Adam moves each number of a lens by its own rate, though only combinations of them change the
+picture. Rays know the combinations without noise. With J, the derivatives of the hits on the sensor
+about the centroid of each object point by the variables, and the gradient g of a loss,
+
+    A = J^T J, mm^2 of mean square displacement;  B = A + damping diag(A)
+    m <- b1 m + (1 - b1) g,   n <- b2 n + (1 - b2) g^T B^-1 g
+    step = -size B^-1 m / sqrt(n), m and n without their bias,
+
+moves the rays by `size`, root mean square, if gradients agree, and less if they do not. No rate
+depends on the unit of a variable, on that of the loss, or on the batch.
+"""
+
+import dataclasses
+import math
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from ..numerics import matmul, safe_divide, safe_sqrt
+from .problem import Problem, quick
+from .within_limits import within_limits
+
+
+class RayState(NamedTuple):
+    """State of `RaySteps`: number of steps, (); running means of the gradient, (N,), and of its
+    square in the metric, (); the metric B, (N, N), mm^2."""
+
+    steps: Array
+    first: Array
+    second: Array
+    metric: Array
+
+
+def cosine(size: float, steps: int, warm: int = 10) -> Callable[[Array], Array]:
+    """A schedule: the length of step k, from 0: rises to `size` in `warm` steps, and falls to 0 at
+    `steps` as half a period of a cosine."""
+
+    def length(k: Array) -> Array:
+        part = jnp.minimum(k / steps, 1.0)
+        return size * jnp.minimum((k + 1) / warm, 1.0) * (1 + jnp.cos(math.pi * part)) / 2
+
+    return length
+
+
+@dataclasses.dataclass(frozen=True)
+class RaySteps:
+    """An optimiser of the vector of a lens, by gradients of any loss.
+
+    spots: problem with the operand "spot": its fields, distances and wavelengths are those whose
+        rays count.
+    limits: problem whose bounds and limits hold, in the metric of the rays, see `within_limits`.
+    size: mm, root mean square over all rays, by which a step moves the hits; or a function of the
+        number of the step, such as `cosine`.
+    damping: of directions that hardly move rays.
+    every: number of steps after which the metric is made anew.
+    b1, b2: decay rates of the means.
+    """
+
+    spots: Problem
+    limits: Problem
+    size: float | Callable[[Array], Array]
+    damping: float = 1e-3
+    every: int = 10
+    b1: float = 0.9
+    b2: float = 0.99
+
+    def init(self, vector: Array) -> RayState:
+        """The state before the first step."""
+        one = jnp.eye(len(vector), dtype=vector.dtype)
+        return RayState(jnp.zeros((), jnp.int32), 0 * vector, jnp.zeros((), vector.dtype), one)
+
+    def metric(self, vector: Array) -> Array:
+        """B, (N, N), mm^2, at a vector."""
+        spots = quick(self.spots)
+        slopes = jax.jacfwd(lambda v: spots.evaluate(v).residuals)(vector)
+        square = matmul(slopes.T, slopes) / (len(spots.fields) * len(spots.distances))
+        diagonal = jnp.diagonal(square)
+        # A variable that moves no ray stays: it has no gradient either.
+        idle = jnp.where(diagonal > 0, self.damping * diagonal, jnp.max(diagonal))
+        return square + jnp.diag(idle)
+
+    def update(self, gradient: Array, state: RayState, vector: Array) -> tuple[Array, RayState]:
+        """The next vector (N,), and the next state. Works in `jit`."""
+        renew = state.steps % self.every == 0
+        metric = jax.lax.cond(renew, self.metric, lambda _: state.metric, vector)
+        gradient = gradient.astype(vector.dtype)
+        square = jnp.vdot(gradient, jnp.linalg.solve(metric, gradient))
+        first = self.b1 * state.first + (1 - self.b1) * gradient
+        second = self.b2 * state.second + (1 - self.b2) * square
+        bias = [1 - b ** (state.steps + 1).astype(vector.dtype) for b in (self.b1, self.b2)]
+        length = safe_sqrt(second / bias[1])
+        unit = safe_divide(jnp.linalg.solve(metric, first) / bias[0], length)
+        k = state.steps.astype(vector.dtype)
+        size = self.size(k) if callable(self.size) else self.size
+        new = within_limits(self.limits, vector, vector - size * unit, metric)
+        return new, RayState(state.steps + 1, first, second, metric)
