@@ -6,14 +6,13 @@ network.
 
 import dataclasses
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
 from jax import Array
 from jax.flatten_util import ravel_pytree
 
-from ..design.ray_steps import RaySteps
 from ..image.sensor import convolve_each
 from ..inputs import require
 from ..numerics import Numbers
@@ -150,10 +149,22 @@ class _Adam(NamedTuple):
         return self.hold(optics, apply_updates(optics, updates["optics"])), state
 
 
-class _OfLens(NamedTuple):
-    """Steps of the vector "lens" of the optics, which keep its limits themselves."""
+@runtime_checkable
+class LensSteps(Protocol):
+    """An optimiser of the vector of a lens that keeps its limits itself, such as
+    `design.RaySteps`."""
 
-    steps: RaySteps
+    def init(self, vector: Array) -> Any:
+        """The state before the first step."""
+
+    def update(self, gradient: Array, state: Any, vector: Array) -> tuple[Array, Any]:
+        """The next vector and state."""
+
+
+class _OfLens(NamedTuple):
+    """Steps of the vector "lens" of the optics."""
+
+    steps: LensSteps
 
     def init(self, optics: Any) -> Any:
         return self.steps.init(optics["lens"])
@@ -173,8 +184,8 @@ def make_field_step(
     """A step of lens and network on the mean absolute error, as (init, step) for `fit`.
 
     imager: the camera.
-    rates: of "network", Adam's learning rates, see `adam`; of "optics", the same, or
-        `design.RaySteps` for optics {"lens": vector of the variables}.
+    rates: of "network", Adam's learning rates, see `adam`; of "optics", the same, or `LensSteps`
+        such as `design.RaySteps`, for optics {"lens": vector of the variables}.
     draw: function that returns the object points of a step from a PRNG key, for instance by
         `draw_points`.
     seed: points and noise depend only on it and on the index of the step.
@@ -185,7 +196,7 @@ def make_field_step(
     """
     init_adam, update = adam(_weights(rates))
     of = rates["optics"]
-    optics = _OfLens(of) if isinstance(of, RaySteps) else _Adam(of, hold)
+    optics = _OfLens(of) if isinstance(of, LensSteps) else _Adam(of, hold)
 
     def init(parameters: dict[str, Any]) -> tuple[Any, Any, Any]:
         parameters = copied(parameters)

@@ -122,9 +122,9 @@ def rms(found: np.ndarray, truth: np.ndarray) -> float:
 QUANTITIES = {
     "spot": Quantity(spot, relative, (1e-3, 1e-5, 1e-7, 1e-9), 1e-11),
     "kernel": Quantity(kernel, summed, (1e-1, 3e-2, 1e-2), 1e-3),
-    "contrast": Quantity(contrast, largest, (1e-2, 3e-3, 1e-3), 1e-4),
-    "strehl": Quantity(strehl, largest, (1e-2, 3e-3, 1e-3), 1e-4),
-    "energy": Quantity(energy, largest, (1e-2, 3e-3, 1e-3), 1e-4),
+    "contrast": Quantity(contrast, largest, (1e-2, 3e-3, 1e-3), 1e-6),
+    "strehl": Quantity(strehl, largest, (1e-2, 3e-3, 1e-3), 1e-6),
+    "energy": Quantity(energy, largest, (1e-2, 3e-3, 1e-3), 1e-5),
     "illumination": Quantity(illumination, largest, (1e-2, 1e-4, 1e-6), 1e-10),
     "photograph": Quantity(photograph, rms, (1e-2, 3e-3), 3e-4),
 }

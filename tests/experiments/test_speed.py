@@ -182,10 +182,10 @@ def test_the_reference_of_waves_is_the_closed_form_of_a_perfect_lens():
     lens = drt_jax.load_lens({"surfaces": [stop, mirror], "sensor": -40})
     wavelength = 0.5
     found, change = wave.transfer(lens, 0.0, wavelength, FREQUENCIES)
-    part = FREQUENCIES * wavelength * 1e-3 * 10
+    part = FREQUENCIES * wavelength * 1e-3 / (2 * np.sin(2 * np.arctan(2.5 / 100)))
     exact = 2 / np.pi * (np.arccos(part) - part * np.sqrt(1 - part**2))
     assert change < 1e-9
-    np.testing.assert_allclose(found, [[exact, exact]] * 2, atol=2e-4)  # sines for tangents
+    np.testing.assert_allclose(found, [[exact, exact]] * 2, atol=1e-4)  # the light is nearly even
     radii = 1e-3 * np.array([1e-3, 2.0, 6.1, 8.0])
     light, change = wave.image(lens, 0.0, wavelength, np.stack([0 * radii, radii], axis=1))
     v = np.pi * radii / (wavelength * 1e-3 * 10)
@@ -200,7 +200,7 @@ def test_the_reference_of_waves_agrees_with_the_library_off_axis():
     at = _waves.view(lens, field, 0.55, _waves.Waves(size=9))
     scene = Scene.point(field, np.inf, (0.55,))
     mtf, change = wave.transfer(at.lens, field, 0.55, FREQUENCIES)
-    own = drt_jax.transfer(at.lens, scene, FREQUENCIES, sampling=1e-5).mtf
+    own = drt_jax.transfer(at.lens, scene, FREQUENCIES, sampling=1e-4).mtf
     assert change < 1e-9
-    np.testing.assert_allclose(own, mtf[0], atol=1e-5)  # light that fills the stop evenly
-    assert 1e-5 < np.max(np.abs(own - mtf[1])) < 1e-2
+    np.testing.assert_allclose(own, mtf[0], atol=1e-4)  # light that fills the stop evenly
+    assert 1e-4 < np.max(np.abs(own - mtf[1])) < 1e-2
