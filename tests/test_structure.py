@@ -49,7 +49,7 @@ ROOMS = {
     "drt_jax/design": 2458,
     "drt_jax/files": 2928,
     "drt_jax/image": 2993,
-    "drt_jax/learn": 641,
+    "drt_jax/learn": 645,
     "drt_jax/lens": 1478,
     "drt_jax/pupil": 776,
     "drt_jax/rays": 1314,
