@@ -171,7 +171,7 @@ def test_our_nodes_through_another_tracer_come_to_the_reference(monkeypatch):
     assert many.error < 1e-11
 
 
-FREQUENCIES = np.array([20.0, 60.0, 200.0])
+FREQUENCIES = np.array([20.0, 60.0, 150.0])
 
 
 @pytest.mark.slow
