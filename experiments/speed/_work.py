@@ -43,6 +43,7 @@ import jax; jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_num_cpu_devices", {devices})
 from experiments import _work
 from experiments._profile import LensFields, Profile
+from experiments._waves import Waves
 from experiments.benchmark import Config
 print(_work.bundle_seconds({config!r}))
 """
