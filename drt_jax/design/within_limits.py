@@ -13,8 +13,8 @@ from .problem import Problem, quick
 _MET = 1e-4
 # Largest number of projections; the number of further evaluations, which halve the step.
 _ROUNDS, _HALVINGS = 3, 6
-# Of `nearest`: a row counts as met up to this part of the largest multiplier; turns for each row.
-_EXACT, _TURNS = 1e-9, 5
+# Of `nearest`: largest number of turns for each row.
+_TURNS = 5
 
 
 class _State(NamedTuple):
@@ -48,7 +48,9 @@ def nearest(vector: Array, metric: Array, rows: Array, most: Array) -> Array:
     back, over = back * unit[None], (matmul(rows, vector) - most) * unit
     square = matmul(rows, back) * unit[:, None]
     count, one = len(most), jnp.eye(len(most), dtype=vector.dtype)
-    tiny = jnp.finfo(vector.dtype).eps * one  # parts rows that are parallel
+    eps = float(jnp.finfo(vector.dtype).eps)
+    tiny = eps * one  # parts rows that are parallel
+    exact = eps**0.5 / 16  # a row counts as met up to this part of the largest multiplier
 
     def turn(state: tuple) -> tuple:
         push, active, _, turns = state
@@ -57,7 +59,7 @@ def nearest(vector: Array, metric: Array, rows: Array, most: Array) -> Array:
         fits = jnp.all(~active | (wanted > 0))
         left = jnp.where(active, -jnp.inf, over - matmul(square, wanted))
         worst = jnp.argmax(left)
-        ends = fits & (left[worst] <= _EXACT * jnp.max(jnp.abs(wanted), initial=0.0))
+        ends = fits & (left[worst] <= exact * jnp.max(jnp.abs(wanted), initial=0.0))
         # As far as no multiplier becomes negative; that of the row that stops it becomes 0.
         part = jnp.where(active & (wanted <= 0), safe_divide(push, push - wanted), 1.0)
         some = push + jnp.min(part) * (wanted - push)

@@ -41,6 +41,17 @@ def test_the_nearest_vector_is_that_of_scipy(seed):
     assert far(found) == pytest.approx(far(exact), rel=1e-5)
 
 
+@pytest.mark.parametrize("seed", range(5))
+def test_in_float32_it_ends_and_is_near(seed):
+    rng = np.random.default_rng(seed)
+    metric = np.diag(np.logspace(-3, 0, 6))
+    given = 3 * rng.normal(size=6), metric, rng.normal(size=(9, 6)), rng.uniform(0, 1, 9)
+    exact = nearest(*map(jnp.asarray, given))
+    found = nearest(*(jnp.asarray(a, jnp.float32) for a in given))
+    assert found.dtype == jnp.float32
+    np.testing.assert_allclose(found, exact, atol=2e-2 * np.max(np.abs(exact)))
+
+
 def test_a_vector_within_all_rows_stays():
     vector = jnp.array([0.1, -0.2])
     stays = nearest(vector, jnp.diag(jnp.array([1.0, 9.0])), jnp.eye(2), jnp.array([1.0, jnp.inf]))
