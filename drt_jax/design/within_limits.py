@@ -100,10 +100,8 @@ def within_limits(
     after = jnp.where(jnp.isfinite(after), after, before)
     one = jnp.eye(len(after), dtype=after.dtype)
     bounds, ends = jnp.concatenate([one, -one]), jnp.concatenate([high, -low])
-    if metric is None:
-        wanted, metric = jnp.clip(after, low, high), one
-    else:
-        wanted = nearest(after, metric, bounds, ends)
+    metric = one if metric is None else metric
+    wanted = jnp.clip(nearest(after, metric, bounds, ends), low, high)
 
     def projected(vector: Array, violations: Array) -> Array:
         """The vector nearest to `after` within bounds and limits, linear about `vector`."""
