@@ -101,7 +101,7 @@ def training(mesh):
 
 
 def joint_training(mesh):
-    """Losses and states of lens and network over the field, by Adam and by damped steps."""
+    """Losses and states of lens and network over the field."""
     lens, pixel = drt_jax.load_lens(LENS), 0.02
     field_of = np.array([[0.01, 0.01]])
     model = drt_jax.converge(
@@ -115,21 +115,18 @@ def joint_training(mesh):
         found = drt_jax.psf(moved, Scene.radians(*seen[:2], COLOURS), pixel, 9, sampling=model)
         return found.kernel, jnp.ones((4, 3))
 
-    def trained(make, rate):
-        convolve = devices.shared(learn.convolve_each, mesh)
-        camera = field.FieldImager(points, devices.shared(restore, mesh, 1), convolve)
-        rates = {"optics": rate, "network": 1e-3}
-        draw = lambda key: field.draw_points(key, 4, 0.02, (5e3, jnp.inf))  # noqa: E731
-        init, step = make(camera, rates, draw, 0)
-        start = {"optics": {"sensor": lens.sensor}, "network": weights(jax.random.key(0))}
-        state, losses = devices.copied(mesh, init(start)), []
-        for k, scenes in enumerate(images):
-            scenes = devices.split(mesh, scenes)
-            state, metrics = step(state, scenes, np.float32(0.01), np.int32(k))
-            losses.append(float(metrics["loss"]))
-        return np.array(losses), devices.gathered(state[0])
-
-    return trained(field.make_field_step, 1e-2), trained(field.make_damped_step, 0.3)
+    convolve = devices.shared(learn.convolve_each, mesh)
+    camera = field.FieldImager(points, devices.shared(restore, mesh, 1), convolve)
+    rates = {"optics": 1e-2, "network": 1e-3}
+    draw = lambda key: field.draw_points(key, 4, 0.02, (5e3, jnp.inf))  # noqa: E731
+    init, step = field.make_field_step(camera, rates, draw, 0)
+    start = {"optics": {"sensor": lens.sensor}, "network": weights(jax.random.key(0))}
+    state, losses = devices.copied(mesh, init(start)), []
+    for k, scenes in enumerate(images):
+        scenes = devices.split(mesh, scenes)
+        state, metrics = step(state, scenes, np.float32(0.01), np.int32(k))
+        losses.append(float(metrics["loss"]))
+    return np.array(losses), devices.gathered(state[0])
 
 
 if __name__ == "__main__":

@@ -65,7 +65,7 @@ def values(problem, lens):
     slope = slope / jnp.where(rays.arrives, rays.bundle.arrival[-1], 1)
     hits, slope = (a - jnp.sum(light * a, -1, keepdims=True) for a in (rays.sensor_hits, slope))
     focus = -jnp.sum(light * hits * slope, (0, -1)) / jnp.sum(light * slope**2, (0, -1))
-    kernels = {kind: design.psf(lens, rays, airy, 15, kind) for kind in ("rays", "waves")}
+    kernels = {kind: design.psf(lens, rays, airy, 15, kind).kernel for kind in ("rays", "waves")}
     return found | {"focus": focus * aperture**2 / WAVELENGTH} | kernels
 
 

@@ -43,5 +43,5 @@ from .tolerance import (
 )
 from .values import OPERANDS as OPERANDS
 from .variables import Tie as Tie, Variables as Variables, Vary as Vary
-from .waves import psf as psf
+from .waves import filter_error as filter_error, psf as psf
 from .within_limits import within_limits as within_limits

@@ -1,4 +1,5 @@
-"""Operands of diffraction: transfer functions, Strehl ratios, encircled energy and kernels.
+"""Operands of diffraction: transfer functions, Strehl ratios, encircled energy, kernels, and the
+error of the best linear filter behind them.
 
 They are computed from the rays that a problem has traced, by the polynomials of `image.beam`, and
 trace no other rays. With the rule `Gauss`, all light that fills the stop counts, clipped or not.
@@ -6,16 +7,19 @@ With `Soft` and `Clipped`, only the light that passes the apertures counts.
 """
 
 from collections.abc import Callable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 from jax import Array
 
 from ..image.beam import Beam, BeamRule, beam_of
-from ..image.beam_psf import Kind, psf_of_beam
+from ..image.beam_psf import Kind, Psf, psf_of_beam
 from ..image.encircled import encircled
 from ..image.kernel import check_pixels
+from ..image.sensor import noise_of
 from ..image.transfer import strehl_of, transfer_of
+from ..image.wiener import wiener
 from ..inputs import shown
 from ..lens.lens import Lens
 from ..lens.scene import Scene
@@ -28,6 +32,8 @@ from .field_rays import EXTRAS, FieldRays
 
 # Cells of the pupil along a side: for transfer functions and Strehl ratios, for encircled energy.
 _CELLS, _ENERGY = 64, 128
+# Mean of photographs, for the shot noise of `filter_error`.
+_MEAN = 0.4
 
 
 def degree_of(rule: PupilRule) -> int:
@@ -40,8 +46,8 @@ def degree_of(rule: PupilRule) -> int:
     return 2 * max(rule.size - 2, 0) if isinstance(rule, Clipped) else 0
 
 
-def _of_beams(lens: Lens, rays: FieldRays, function: Callable[[Beam], Array]) -> Array:
-    """Evaluates a function of the beam of each view, (V, ...)."""
+def _of_beams(lens: Lens, rays: FieldRays, function: Callable[[Beam], Any]) -> Any:
+    """Evaluates a function of the beam of each view: arrays (V, ...)."""
     full, degree = isinstance(rays.rule, Gauss), degree_of(rays.rule)
     light = rays.stop_weights if full else rays.weights * rays.throughput[..., None]
     light = jnp.where(rays.arrives, light, 0)
@@ -49,7 +55,7 @@ def _of_beams(lens: Lens, rays: FieldRays, function: Callable[[Beam], Array]) ->
     azimuths = rays.rule.order if isinstance(rays.rule, Gauss | Soft) else degree
     rule = BeamRule(rays.rule, degree, azimuths=azimuths)
 
-    def one(field: Array, distance: Array, points: Vector, light: Array, bundle: Bundle) -> Array:
+    def one(field: Array, distance: Array, points: Vector, light: Array, bundle: Bundle) -> Any:
         scene = Scene(field, distance, rays.wavelengths)
         return function(beam_of(lens, scene, rule, points, light, bundle))
 
@@ -94,8 +100,8 @@ def psf(
     size: int = 21,
     kind: Kind = "waves",
     cells: int = _ENERGY,
-) -> Array:
-    """Kernels of all views, for operands of your own; see `drt_jax.psf`.
+) -> Psf:
+    """Kernels of all views and their light, for operands of your own; see `drt_jax.psf`.
 
     lens: the lens.
     rays: its rays, as `trace_fields` returns them or as an operand gets them.
@@ -105,7 +111,8 @@ def psf(
     cells: number of cells of the pupil grid along a side; more for spots of many pixels, see
         `converge`.
 
-    Returns (V, W, size, size). ValueError for a rule whose rays do not determine polynomials.
+    Returns a `Psf` with kernels (V, W, size, size). ValueError for a rule whose rays do not
+    determine polynomials.
     """
     if degree_of(rays.rule) < 2:
         raise ValueError(
@@ -113,4 +120,36 @@ def psf(
         )
     waves = rays.wavelengths
     options = waves, check_pixels(pixel, size, waves.dtype), kind, cells
-    return _of_beams(lens, rays, lambda beam: psf_of_beam(lens, beam, *options).kernel)
+    return _of_beams(lens, rays, lambda beam: psf_of_beam(lens, beam, *options))
+
+
+def filter_error(
+    power: Numbers,
+    noise: Numbers,
+    light: Numbers,
+    pixel: Numbers,
+    size: int = 21,
+    kind: Kind = "waves",
+    cells: int = _CELLS,
+) -> Callable[[Lens, FieldRays], Array]:
+    """An operand of your own: the error of the best linear filter behind the lens, for all fields,
+    distances and wavelengths of a problem together, see `image.wiener`.
+
+    Its merit is the mean square error of the restored image, summed over the channels (one a
+    wavelength): a lens is designed for what comes out of the computer, without images or training.
+    Begin with a lens that spots have finished, and with `Operand` around it for a weight.
+
+    power: (N, N // 2 + 1, W, W), see `learn.power_of`; N of `size` at least.
+    noise: see `learn.noise_of`.
+    light: (W,) or (), solid angle of the light for which the noise is said, see `drt_jax.psf`: less
+        of it is amplified. Shot noise is that of the value 0.4.
+    pixel, size, kind, cells: as in `psf`.
+    """
+
+    def residuals(lens: Lens, rays: FieldRays) -> Array:
+        seen = psf(lens, rays, pixel, size, kind, cells)
+        full = jnp.asarray(light, seen.solid_angle.dtype)
+        grain = noise_of(noise, seen.solid_angle / full[None], _MEAN)
+        return safe_sqrt(wiener(seen.kernel, grain, power, 1).error).ravel()
+
+    return residuals

@@ -6,10 +6,12 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from ..numerics import EXACT, Numbers, einsum
+from ..numerics import EXACT, Numbers, einsum, safe_sqrt
 from .kernel import SeparableKernel
 
 Convolve = Callable[[Array, SeparableKernel | Array], Array]
+# Smallest amount of light for which the gain of the sensor compensates; below it the image is dark.
+_DARKEST = 0.02
 
 
 def _banded(kernel: Array, outputs: int) -> Array:
@@ -147,3 +149,18 @@ def sensor_layer(
     images = convolve(scenes, jax.tree.map(lambda array: array.astype(scenes.dtype), kernel))
     white = jax.random.normal(key, images.shape, images.dtype)
     return images + jnp.asarray(noise, images.dtype) * white
+
+
+def noise_of(noise: Numbers, light: Array, value: Numbers) -> Array:
+    """Standard deviation of the noise of an image whose gain makes up for the light that is lost.
+
+    noise: standard deviation of the read noise, (); or of read and shot noise, (2,), that of the
+        shot noise at the value 1, both where the light is 1.
+    light: on the sensor, relative; below 0.02 the gain stays.
+    value: of the image without noise, from 0 to 1, shape as `light`, or what broadcasts to it.
+    """
+    gain = 1 / jnp.maximum(light, _DARKEST)
+    read, *shot = jnp.atleast_1d(jnp.asarray(noise, gain.dtype))
+    if not shot:
+        return gain * read
+    return safe_sqrt((gain * read) ** 2 + gain * shot[0] ** 2 * jnp.maximum(jnp.asarray(value), 0))

@@ -1,8 +1,8 @@
 """The network and its training; no optics formula in here.
 
 Data: `load_patches`, `batches`. One blur for all patches, as in the paper: `make_imager`,
-`make_step`. Object points anywhere in the field: `FieldImager`, `draw_points`, `make_field_step`,
-`make_damped_step`. The loop: `fit`, `evaluate`.
+`make_step`. Object points anywhere in the field: `FieldImager`, `draw_points`, `make_field_step`.
+The best linear filter of a lens: `power_of`, `wiener`, `filtered`. The loop: `fit`, `evaluate`.
 """
 
 from ..image.depth import depth_moments as depth_moments, moments_model as moments_model
@@ -10,7 +10,13 @@ from ..image.kernel import gaussian_psf as gaussian_psf, separable_psf as separa
 from ..image.sensor import (
     convolve as convolve,
     convolve_each as convolve_each,
+    noise_of as noise_of,
     sensor_layer as sensor_layer,
+)
+from ..image.wiener import (
+    apply_filter as apply_filter,
+    power_of as power_of,
+    wiener as wiener,
 )
 from ..lens.lens import movable as movable
 from .adam import adam as adam, apply_updates as apply_updates
@@ -24,10 +30,13 @@ from .field import (
     FieldImager as FieldImager,
     ObjectPoints as ObjectPoints,
     draw_points as draw_points,
-    make_damped_step as make_damped_step,
     make_field_step as make_field_step,
 )
-from .network import count_parameters as count_parameters, red_net as red_net
+from .network import (
+    count_parameters as count_parameters,
+    filtered as filtered,
+    red_net as red_net,
+)
 from .train import (
     Camera as Camera,
     evaluate as evaluate,

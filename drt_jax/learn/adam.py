@@ -24,13 +24,14 @@ class AdamState(NamedTuple):
 
 
 def adam(
-    rates: float | Mapping[str, Any], b1: float = 0.9, b2: float = 0.999, eps: float = 1e-8
+    rates: Any, b1: float = 0.9, b2: float = 0.999, eps: float = 1e-8
 ) -> tuple[Callable[[Any], AdamState], Callable[[Any, AdamState], tuple[Any, AdamState]]]:
     """The optimiser Adam as a pair of functions (init, update).
 
     rates: one learning rate, or one for each top-level key of the parameters, such as {"optics":
-        1e-2, "network": 1e-3}; a rate may be such a mapping itself. `update` raises KeyError for a
-        key without a rate.
+        1e-2, "network": 1e-3}; a rate may be such a mapping itself, or a function of the number of
+        the step, from 0, such as `design.cosine`. `update` raises KeyError for a key without a
+        rate.
     b1, b2: decay rates of the first and second moment.
     eps: added to the root of the second moment.
 
@@ -50,6 +51,8 @@ def adam(
         def scaled(rate: Any, first: Any, second: Any) -> Any:
             if isinstance(rate, Mapping):
                 return {name: scaled(rate[name], first[name], second[name]) for name in first}
+
+            rate = rate(state.steps) if callable(rate) else rate
 
             def leaf(m: Array, v: Array) -> Array:
                 # 1 - b^steps, without cancellation, by which float32 would lose five digits.

@@ -11,9 +11,8 @@ from typing import Any, NamedTuple, Protocol, runtime_checkable
 import jax
 import jax.numpy as jnp
 from jax import Array
-from jax.flatten_util import ravel_pytree
 
-from ..image.sensor import convolve_each
+from ..image.sensor import convolve_each, noise_of
 from ..inputs import require
 from ..numerics import Numbers
 from .adam import adam, apply_updates, copied
@@ -24,11 +23,6 @@ from .train import compiled_step, truth_of
 Points = Callable[[Any, "ObjectPoints"], tuple[Array, Array]]
 # A function from the optics before and after an update to optics that can be built.
 Hold = Callable[[Any, Any], Any]
-# Smallest amount of light for which the gain of the sensor compensates; below it the image is dark.
-_DARKEST = 0.02
-# Lower bound of the mean residual in the curvature of the mean absolute error, for values from 0
-# to 1.
-_SMALLEST = 1e-3
 
 
 @dataclasses.dataclass(frozen=True)
@@ -59,7 +53,8 @@ class FieldImager:
         scenes: floating (B, H + K - 1, W + K - 1, C), values from 0 to 1; patch b shows point b P
             // B.
         seen: the P object points; B is a multiple of P.
-        noise: standard deviation of the noise where the light is 1.
+        noise: standard deviation of read noise, (), or of read and shot noise, (2,), see
+            `noise_of`.
         key: a PRNG key.
         """
         count = seen.fields.shape[0]
@@ -68,10 +63,9 @@ class FieldImager:
         each = scenes.shape[0] // count
         kernels, light = self.points(optics, seen)
         image = self.convolve(scenes, kernels.repeat(each, axis=0))
-        gain = 1 / jnp.maximum(light, _DARKEST).astype(image.dtype)
+        light = light.astype(image.dtype).repeat(each, axis=0)[:, None, None, :]
         white = jax.random.normal(key, image.shape, image.dtype)
-        grain = jnp.asarray(noise, image.dtype) * white
-        return image + gain.repeat(each, axis=0)[:, None, None, :] * grain
+        return image + noise_of(noise, light, image) * white
 
     def __call__(
         self,
@@ -81,7 +75,8 @@ class FieldImager:
         noise: Numbers,
         key: Array,
     ) -> tuple[Array, Array, Array]:
-        """True, sensor and restored images (B, H, W, C), in the dtype of the imager.
+        """True, sensor and restored images (B, H, W, C), in the dtype of the imager: of all, the
+        part that the network restores, such as the middle.
 
         parameters: "optics", and "network" for a network.
         scenes: uint8 (B, H + K - 1, W + K - 1, C).
@@ -89,12 +84,9 @@ class FieldImager:
         """
         real = scenes.astype(self.dtype) / 255
         image = self.sensor(parameters["optics"], real, seen, noise, key)
-        return truth_of(real, image), image, self._restored(parameters, image)
-
-    def _restored(self, parameters: dict[str, Any], image: Array) -> Array:
-        """The images that the network restores."""
         restore = self.restore
-        return image if restore is None else restore(parameters.get("network"), image)
+        found = image if restore is None else restore(parameters.get("network"), image)
+        return truth_of(real, found), truth_of(image, found), found
 
 
 class ObjectPoints(NamedTuple):
@@ -214,77 +206,6 @@ def make_field_step(
         updates, moments = update(_weights(gradients), moments)
         new = apply_updates(_weights(parameters), updates)
         new["optics"], means = optics.update(gradients["optics"], means, parameters["optics"])
-        return (new, moments, means), {"loss": error}
-
-    return init, compiled_step(step)
-
-
-class _Newton(NamedTuple):
-    """Running means for the optics: gradient (N,) and curvature (N, N), with the same weights."""
-
-    gradient: Array
-    curvature: Array
-
-    def step(self, damping: float) -> Array:
-        """The full step (N,): -(C + damping diag(C))^-1 gradient, with the curvature C."""
-        diagonal = jnp.diag(self.curvature)
-        least = jnp.finfo(diagonal.dtype).eps * jnp.max(diagonal)
-        raised = self.curvature + jnp.diag(damping * diagonal + jnp.where(least > 0, least, 1))
-        return -jnp.linalg.solve(raised, self.gradient)
-
-
-def make_damped_step(
-    imager: FieldImager,
-    rates: dict[str, Any],
-    draw: Callable[[Array], ObjectPoints],
-    seed: int,
-    hold: Hold = lambda before, after: after,
-    damping: float = 0.1,
-    memory: float = 0.9,
-) -> tuple[Callable, Callable]:
-    """As `make_field_step`, but the optics take damped least-squares steps.
-
-    rates: of "optics", the fraction of a full step; of "network", the learning rate as before.
-    damping: added to the curvature, relative to its diagonal.
-    memory: decay rate of the running means of gradient and curvature.
-
-    The gradient is exact. The curvature is that of Gauss and Newton for the pixels in front of the
-    network, J^T J / (number of pixels times mean absolute residual), with J computed in forward
-    mode through rays and kernels. The optics are a dict of vectors.
-    """
-    init_adam, update = adam({"network": rates["network"]})
-
-    def init(parameters: dict[str, Any]) -> tuple[Any, Any, _Newton]:
-        parameters = copied(parameters)
-        vector = ravel_pytree(parameters["optics"])[0]
-        empty = _Newton(0 * vector, jnp.zeros((vector.size,) * 2, vector.dtype))
-        return parameters, init_adam(_weights(parameters)), empty
-
-    def step(state: tuple[Any, Any, _Newton], scenes: Array, noise: Array, index: Array):
-        parameters, moments, means = state
-        (seen, noise_key), real = _drawn(draw, seed, index), scenes.astype(imager.dtype) / 255
-        vector, optics_of = ravel_pytree(parameters["optics"])
-
-        def sensor(vector):
-            return imager.sensor(optics_of(vector), real, seen, noise, noise_key)
-
-        image, derivative = jax.linearize(sensor, vector)
-        slopes = jax.vmap(derivative)(jnp.eye(vector.size, dtype=vector.dtype))
-        truth = truth_of(real, image)
-
-        def loss(weights, image):
-            return jnp.mean(jnp.abs(imager._restored(weights, image) - truth))
-
-        weights = _weights(parameters)
-        error, (gradients, image_gradient) = jax.value_and_grad(loss, (0, 1))(weights, image)
-        flat = slopes.reshape(vector.size, -1)
-        size = jnp.maximum(error, _SMALLEST) * flat.shape[1]
-        now = _Newton(flat @ image_gradient.ravel(), flat @ flat.T / size)
-        means = jax.tree.map(lambda m, n: memory * m + (1 - memory) * n.astype(m.dtype), means, now)
-        moved = vector + rates["optics"] * means.step(damping)
-        updates, moments = update(gradients, moments)
-        new = apply_updates(weights, updates)
-        new["optics"] = hold(parameters["optics"], optics_of(moved))
         return (new, moments, means), {"loss": error}
 
     return init, compiled_step(step)

@@ -14,6 +14,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
+from ..image.wiener import apply_filter
 from ..inputs import require
 from .convolution import convolve_3x3
 
@@ -80,6 +81,29 @@ def red_net(
         return images + features if input_skip else features
 
     return init, apply
+
+
+def filtered(network: tuple[Callable, Callable], taps: Array) -> tuple[Callable, Callable]:
+    """A network behind a linear filter of many taps, which is trained with it, as (init, apply).
+
+    A network of small kernels does not see a wide blur; one that begins with the best filter of its
+    lens, see `wiener`, does.
+
+    network: (init, apply), such as `red_net`.
+    taps: (T, T, C, C), [y, x, in, out], at the start, in the dtype of the images.
+
+    init(key) -> {"taps", "network"}: give "taps" a smaller rate, such as 1e-5. apply(parameters,
+    images (B, H, W, C)) -> restored images (B, H - T + 1, W - T + 1, C), see `apply_filter`.
+    """
+    init, apply = network
+
+    def begin(key: Array) -> dict[str, Any]:
+        return {"taps": taps, "network": init(key)}
+
+    def restore(parameters: dict[str, Any], images: Array) -> Array:
+        return apply(parameters["network"], apply_filter(parameters["taps"], images))
+
+    return begin, restore
 
 
 def count_parameters(parameters: object) -> int:

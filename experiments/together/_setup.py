@@ -18,37 +18,36 @@ from drt_jax.design.optimum import init_problem, take_step
 from drt_jax.design.problem import quick
 from drt_jax.devices import shared
 from drt_jax.learn.data import Patches
-from drt_jax.learn.field import (
-    FieldImager,
-    ObjectPoints,
-    draw_points,
-    make_damped_step,
-    make_field_step,
-)
+from drt_jax.learn.field import FieldImager, ObjectPoints, draw_points, make_field_step
 
 from . import _common
 from ._sharing import mesh_of
 from .runs.config import ConfigError
 
-# Relative fields of least squares, and the order of its pupil rule.
-_FIELDS, _ORDER = np.array([0.0, 0.7, 1.0]), 6
+# Fields of least squares: rings of equal area, and the edge with a small weight, so that limits
+# hold there; depths, and the order of the pupil rule.
+_RINGS, _EDGE, _DEPTHS, _ORDER = 4, 0.05, 5, 6
+# Side of the spectra behind filters, pixels; most Jacobians of least squares on their error.
+_SIDE, _JACOBIANS = 64, 60
 # Light outside of a kernel that the spoilt lens may have.
 _LOST = 0.2
 # Lenses as built that training draws from, and their seed; the judge takes another.
 _BUILDS, SEED = 4096, 1
-# Golden angle, radians.
-_TURN = math.pi * (3 - math.sqrt(5))
+# Mean of photographs; golden angle, radians.
+_MEAN, _TURN = 0.4, math.pi * (3 - math.sqrt(5))
 
 
 class Arm(NamedTuple):
     """One way to design lens and network.
 
     title: its name in tables and figures.
-    begins: lens at the start: "spoilt", or finished by least squares on "spots" or "mtf".
+    begins: lens at the start, see `Setup.finished`.
     moves: what training changes of the lens: "all" variables, the "sensor", or "nothing".
-    steps: of the lens: "adam", "rays" (`design.RaySteps`) or "damped" (least squares on pixels).
+    steps: of the lens: "adam", "cosine" (Adam, with rates that fall as a cosine), or "rays"
+        (`design.RaySteps`).
     frozen: True for the network that the arm `spots` has trained, which stays.
     as_built: True for a lens with errors of its own in each step.
+    longer: factor of the number of steps.
     """
 
     title: str
@@ -57,52 +56,68 @@ class Arm(NamedTuple):
     steps: str = "adam"
     frozen: bool = False
     as_built: bool = False
+    longer: int = 1
 
 
 ARMS = {
     "focus": Arm("(a) focus and network", "spoilt", "sensor"),
+    "given": Arm("(a) lens as it is, then network", "given", "nothing"),
     "spots": Arm("(b) least squares on spots, then network", "spots", "nothing"),
+    "longer": Arm("(b) with twice the steps", "spots", "nothing", longer=2),
+    "stopped": Arm("(b) with its best stop", "stopped", "nothing"),
+    "freed": Arm("(b) with its best stop and all variables", "freed", "nothing"),
     "mtf": Arm("(c) least squares on MTF, then network", "mtf", "nothing"),
-    "joint": Arm("(d) jointly from the spoilt lens", "spoilt"),
-    "joint_from_spots": Arm("(e) jointly from (b)", "spots"),
-    "frozen": Arm("(f) lens of (b) through its frozen network", "spots", frozen=True),
-    "damped": Arm("(d) with least-squares steps of the lens", "spoilt", steps="damped"),
+    "joint": Arm("(d) jointly from the spoilt lens, Adam", "spoilt"),
     "rays": Arm("(d) with steps of rays", "spoilt", steps="rays"),
+    "joint_from_spots": Arm("(e) jointly from (b), Adam", "spots"),
+    "cosine_from_spots": Arm("(e) with Adam, rates as a cosine", "spots", steps="cosine"),
     "rays_from_spots": Arm("(e) with steps of rays", "spots", steps="rays"),
+    "frozen": Arm("(f) lens of (b) through its frozen network", "spots", frozen=True),
+    "filter": Arm("(g) least squares on the filter's error, then network", "filter", "nothing"),
+    "rays_from_filter": Arm("(h) jointly from (g), steps of rays", "filter", steps="rays"),
+    "rays_from_given": Arm("(h) jointly from (a), steps of rays", "given", steps="rays"),
     "tolerant": Arm("(e) with lenses as built", "spots", as_built=True),
 }
+# Of each finished lens the one that it begins with.
+_BEFORE = {"spots": "spoilt", "mtf": "spots", "stopped": "spots", "freed": "stopped"}
 
 
 class Setup:
     """What all arms of a run share.
 
     variables: of the lens, with open apertures.
-    spots, sharp: problems of least squares, on spots and on MTF.
+    spots: problem of least squares on spots, with the variables that it moves.
     limits: problem whose limits hold in training.
     spoilt: (N,), vector of the spoilt lens.
     patches: training and test patches.
     pixels: side of a pixel, mm, and of a kernel, pixels.
+    noise: standard deviation of read noise, and of shot noise if there is any.
     mesh: devices that share a batch; None for one.
     """
 
     def __init__(self, config: Any, patches: Patches) -> None:
         self.config, self.patches = config, patches
         self._steps: dict[tuple, tuple[Callable, Callable]] = {}
+        self._finished: dict[str, Array] = {}
         lens = design.open_apertures(drt_jax.load_lens(config.lens))
-        self.variables = self._variables(lens)
+        if config.model_glass:
+            lens = drt_jax.with_model_glass(lens, config.model_glass)
+        self.noise = (config.noise, config.shot)[: 1 + bool(config.shot)]
         self.waves = np.array(config.wavelengths_um)
         self.pixels = 1e-3 * config.camera.pixel_um, config.camera.kernel
         self.field = math.radians(config.field_deg)
         self.depths = tuple(1e3 * d for d in config.depth_m)
-        contrast = design.Operand("mtf", target=1.0, at=config.mtf_at)
-        limits = tuple(config.limits)
-        self.spots, self.sharp = (self._problem((o, *limits)) for o in ("spot", contrast))
-        self.limits = self._problem(limits or ("spot",))
+        self.variables = self._variables(lens, free=True)
+        self.spots = self._problem(self._variables(lens, config.held), "spot")
+        self._all_spots = self._problem(self.variables, "spot")
+        self.limits = self._all_spots
+        if config.limits:
+            self.limits = self._problem(self.variables)
         spoil = config.spoil
         errors = spoil.per_cent, spoil.off_mm, spoil.seed
         vector = design.as_built_starts(self.variables, 1, *errors)[0]
         self.spoilt = jnp.clip(vector, self.variables.low, self.variables.high)
-        self.init, self.restore = learn.red_net(**dataclasses.asdict(config.network))
+        self._begin, self.restore = learn.red_net(**dataclasses.asdict(config.network))
         self.mesh = mesh_of(config.devices)
         self.model = self._model()
         axis = Scene.point(0.0, self.depths[1], self.waves)
@@ -114,36 +129,98 @@ class Setup:
         room = f"camera.kernel: {size} pixels of {config.camera.pixel_um:g} um"
         remedy = f"{room} need {least} cells of waves: raise judge.cells or give a smaller kernel"
         _common.require(config.judge.cells >= least, remedy)
+        if config.taps:
+            self._power = learn.power_of(patches.train, _SIDE)
+            more = self._power, self.noise, self._axis, *self.pixels, config.camera.kind
+            error = design.Operand(design.filter_error(*more, cells=self.model.cells))
+            self.filtered = self._problem(self.variables, error)
+            taps = jnp.zeros((config.taps, config.taps, 3, 3), jnp.float32)
+            self._begin, self.restore = learn.filtered((self._begin, self.restore), taps)
         if config.tolerances:
             radius = self.spots.beam_radius(lens)
             self.built = design.PerturbedLens.from_lens(lens, radius, config.tolerances)
-            self._whole = self._variables(self.built.lens)
+            self._whole = self._variables(self.built.lens, free=True)
 
-    def _variables(self, lens: Lens) -> design.Variables:
-        config, middle = self.config, (self.config.wavelengths_um[1],)
-        solves = [
-            dataclasses.replace(s, distance=1e3 * config.depth_m[1], wavelengths=middle)
-            for s in config.solves
-        ]
-        return design.Variables.from_lens(lens, config.variables, config.ties, solves)
+    def _variables(
+        self, lens: Lens, held: tuple[str, ...] = (), stop: float = 1.0, free: bool = False
+    ) -> design.Variables:
+        """Variables of a lens but for those of the kinds `held`. stop: factor of the diameter of
+        the entrance pupil, where it is solved for. free: True for the stop as a variable, where
+        `stops` says so."""
+        config, solves = self.config, []
+        vary = [v for v in config.variables if v.kind not in held]
+        free = free and bool(config.stops)
+        for solve in config.solves:
+            own = dataclasses.replace(
+                solve, distance=self.depths[1], wavelengths=(config.wavelengths_um[1],)
+            )
+            is_pupil = own.kind == "entrance_pupil"
+            if not (free and is_pupil):
+                solves.append(own.with_value(own.value * stop) if is_pupil else own)
+        if free:
+            own = float(lens.semi_diameter[lens.stop])
+            vary.append(design.Vary("semi_diameter", (lens.stop,), (), 0.05 * own, 2 * own))
+        return design.Variables.from_lens(lens, vary, config.ties, solves)
 
-    def _problem(self, operands: tuple) -> design.Problem:
+    def _problem(self, variables: design.Variables, *operands: Any) -> design.Problem:
         near, far = (1 / d for d in self.depths)
-        parts = np.unique(np.linspace(near, far, 1 if near == far else 3))
+        parts = np.unique(np.linspace(near, far, 1 if near == far else _DEPTHS))
         distances = [1 / p if p > 0 else math.inf for p in parts]
-        fields = _FIELDS * self.field
-        return design.Problem.from_variables(
-            self.variables, operands, Scene.grid(fields, distances, self.waves), _ORDER
-        )
+        rings = np.append(np.sqrt((np.arange(_RINGS) + 0.5) / _RINGS), 1.0)
+        fields, weights = np.arctan(np.tan(self.field) * rings), [1.0] * _RINGS + [_EDGE]
+        scene = Scene.grid(fields, distances, self.waves, field_weights=weights)
+        both = (*operands, *self.config.limits)
+        return design.Problem.from_variables(variables, both, scene, _ORDER)
+
+    def finished(self, name: str, once: Callable[[str, Callable[[], list]], list]) -> Array:
+        """The vector of a lens at the start of an arm: "given", "spoilt", or what least squares
+        make of it: on "spots", on "mtf", on spots with the best stop ("stopped", the one with the
+        least error of the filter) and with all variables ("freed"), and on the error of the
+        "filter". once: keeps a result, see `Run.once`."""
+        if name in ("given", "spoilt"):
+            return self.spoilt if name == "spoilt" else self.variables.start
+        if name not in self._finished:
+            best = "stopped" if self.config.stops else "spots"
+            before = self.finished(_BEFORE.get(name, best), once)
+
+            def finish() -> list[float]:
+                print(f"least squares: {name}", flush=True)
+                return self._finish(name, self.variables.lens_of(before)).tolist()
+
+            self._finished[name] = jnp.asarray(once(f"finish {name}", finish))
+        return self._finished[name]
+
+    def _finish(self, name: str, lens: Lens) -> Array:
+        """The vector of a lens that least squares have finished, see `finished`."""
+        held = () if name == "freed" else self.config.held
+
+        def best(problem: design.Problem, steps: int = 100) -> Array:
+            start = problem.variables.vector(lens)
+            found = design.optimise(problem, start, steps)
+            return self.variables.vector(problem.variables.lens_of(found.vector))
+
+        if name == "filter":
+            return best(self.filtered, _JACOBIANS)
+        if name == "mtf":
+            sharp = design.Operand("mtf", target=1.0, at=self.config.mtf_at)
+            return best(self._problem(self._variables(lens, held), sharp))
+        if name == "spots":
+            return best(self._problem(self._variables(lens, held), "spot"))
+        stops = {s: self._variables(lens, held, s) for s in self.config.stops}
+        found = [best(self._problem(own, "spot")) for own in stops.values()]
+        errors = [float(self.filtered.merit(vector)) for vector in found]
+        for stop, error in zip(stops, errors):
+            print(f"stop {stop:g}: {-10 * math.log10(error / 3):.2f} dB behind the filter")
+        return found[int(np.argmin(errors))]
 
     @functools.cached_property
     def rates(self) -> Array:
         """Adam's rate of each variable: at the spoilt lens it changes the spots by as much as all
         others, `train.optics_rate`, root mean square over rays, fields and depths."""
-        tried = quick(self.spots)
+        tried = quick(self._all_spots)
         search = take_step(tried, init_problem(tried, self.spoilt))
         rows = search.residuals.size - search.evaluation.constraints.size
-        views = len(self.spots.fields) * len(self.spots.distances)
+        views = len(tried.fields) * len(tried.distances)
         slopes = jnp.sqrt(jnp.sum(search.jacobian[:rows] ** 2, axis=0) / views)
         slopes = jnp.maximum(slopes, 1e-3 * jnp.max(slopes))
         return 1e-3 * self.config.train.optics_rate / slopes
@@ -159,6 +236,8 @@ class Setup:
             try:
                 tolerance = self.config.camera.tolerance
                 model = drt_jax.converge(drt_jax.psf, *given, "rays", tolerance)
+                if self.config.camera.kind == "waves":
+                    model = dataclasses.replace(model, kind="waves", cells=self.config.judge.cells)
             except ValueError as error:
                 raise ConfigError(f"field_deg: {error}") from error
             worst = float(np.max(drt_jax.psf(*given, sampling=model).outside))
@@ -187,7 +266,7 @@ class Setup:
         return drt_jax.psf(lens, scene, *self.pixels, sampling=model)
 
     def points(self, optics: Any, seen: ObjectPoints) -> tuple[Array, Array]:
-        """Kernels and light of points, by rays."""
+        """Kernels and light of points, by the model of training."""
         found = self._psfs(optics, seen, self.waves, self.model)
         return found.kernel, found.solid_angle / self._axis[None]
 
@@ -233,13 +312,17 @@ class Setup:
         """(init, step); stays: True for a lens that stays, the others as in `Arm`."""
         setting, restore = self.config.train, shared(self.restore, self.mesh, 1)
         rates: dict[str, Any] = {"network": setting.network_rate, "optics": 0.0}
-        if steps == "damped":
-            rates["optics"] = setting.damped_rate
-        elif steps == "rays":
+        if self.config.taps:
+            rates["network"] = {"taps": setting.taps_rate, "network": setting.network_rate}
+        if steps == "rays":
             size = design.cosine(1e-3 * setting.rays_um, setting.batches)
-            rates["optics"] = design.RaySteps(self.spots, self.limits, size)
+            rates["optics"] = design.RaySteps(self._all_spots, self.limits, size)
         elif not stays:
-            rates["optics"] = {"lens": self.rates, "moves": 0.0}
+            falls = design.cosine(1.0, setting.batches, 1)
+            lens: Any = self.rates
+            if steps == "cosine":
+                lens = lambda k: self.rates * falls(k.astype(self.rates.dtype))  # noqa: E731
+            rates["optics"] = {"lens": lens, "moves": 0.0}
 
         # Neither derivatives nor limits of a lens or a network that stays.
         def points(optics: Any, seen: ObjectPoints) -> tuple[Array, Array]:
@@ -263,20 +346,35 @@ class Setup:
             return before | {"lens": design.within_limits(self.limits, before["lens"], vector)}
 
         imager = FieldImager(points, restored, shared(learn.convolve_each, self.mesh))
-        make = make_damped_step if steps == "damped" else make_field_step
-        return make(imager, rates, draw, 0, hold)
+        return make_field_step(imager, rates, draw, 0, hold)
 
     def start(self, arm: Arm, seed: int, vector: Array, weights: Any) -> dict[str, Any]:
         """The parameters of an arm at the start, from the vector of its lens and, for a frozen
         network, its weights."""
         optics = {"lens": vector}
-        if arm.steps == "adam":
+        if arm.steps != "rays":
             moves = [arm.moves != "sensor" or name == "sensor" for name in self.variables.names]
             optics["moves"] = jnp.asarray(np.array(moves, float))
-        network = weights if arm.frozen else self.init(jax.random.key(seed))
+        network = weights if arm.frozen else self._begin(jax.random.key(seed))
+        if self.config.taps and not arm.frozen:
+            network |= {"taps": self._taps(optics)}
         return {"optics": optics, "network": network}
+
+    @functools.cached_property
+    def _taps(self) -> Callable[[Any], Array]:
+        """The taps of the best filter of a lens, over the field and all depths."""
+        key = jax.random.key(0)
+        seen = draw_points(key, _RINGS * _DEPTHS, self.field, self.depths)
+
+        def taps(optics: Any) -> Array:
+            kernels, light = self.points(optics, seen)
+            grain = learn.noise_of(np.array(self.noise), light, _MEAN)
+            found = learn.wiener(kernels, grain, self._power, self.config.taps)
+            return found.taps.astype(jnp.float32)
+
+        return jax.jit(taps)
 
     def spot_um(self, vector: Array) -> float:
         """RMS radius of the spots of all fields and depths, um."""
-        views = len(self.spots.fields) * len(self.spots.distances)
-        return 1e3 * math.sqrt(float(self.spots.merit(vector)) / views)
+        views = len(self._all_spots.fields) * len(self._all_spots.distances)
+        return 1e3 * math.sqrt(float(self._all_spots.merit(vector)) / views)

@@ -30,9 +30,10 @@ _SHOWN = 5
 
 def run(config: Any, run: Run) -> dict[str, Any]:
     """Finishes the lenses, trains and judges all arms."""
-    side = config.train.patch + config.camera.kernel - 1
+    side = config.train.patch + config.camera.kernel - 1 + max(config.taps - 1, 0)
     setup = Setup(config, _training.read_patches(config.data, side, 0, run.folder))
-    lenses = {"spoilt": setup.spoilt} | _finished(setup, run)
+    begins = {"spoilt": None} | {ARMS[arm].begins: None for arm in ARMS if arm in config.arms}
+    lenses = {name: setup.finished(name, run.once) for name in begins}
     (run.folder / "lenses").mkdir(exist_ok=True)
     _save(setup, run, "spoilt", setup.spoilt)
     imager = jax.jit(FieldImager(setup.judged_points, setup.restore).__call__)
@@ -72,30 +73,13 @@ def run(config: Any, run: Run) -> dict[str, Any]:
     }
 
 
-def _finished(setup: Setup, run: Run) -> dict[str, Array]:
-    """The vectors of the lens that least squares has finished, on spots and then on MTF."""
-    found, vector = {}, setup.spoilt
-    for name, problem in (("spots", setup.spots), ("mtf", setup.sharp)):
-        if name == "mtf" and "mtf" not in setup.config.arms:
-            continue
-
-        def finish() -> list[float]:
-            print(f"least squares: {name}", flush=True)
-            return design.optimise(problem, vector).vector.tolist()
-
-        found[name] = vector = jnp.asarray(run.once(f"finish {name}", finish))
-    return found
-
-
 def _train(
     setup: Setup, run: Run, arm: str, seed: int, begin: dict[str, Any]
 ) -> tuple[dict[str, Any], float]:
     """Trained parameters of a job, from its last checkpoint or from `begin` on, and the seconds of
     a step."""
     setting, job = setup.config.train, f"{arm} {seed}"
-    total = setting.batches
-    if ARMS[arm].steps == "damped":
-        total = max(1, round(setting.damped_part * total))
+    total = setting.batches * ARMS[arm].longer
     init, same = setup.step(ARMS[arm])
     # Points and noise of their own for each seed, by one program.
     step = lambda *given: same(*given[:3], np.int32(given[3] + _APART * seed))  # noqa: E731
@@ -109,7 +93,7 @@ def _train(
 
     scenes = batches(setup.patches.train, setting.batch, seed, first)
     loop = _training.Loop(run, job, range(first, total), setting.checkpoint_every, setup.mesh)
-    state = loop.train(step, state, scenes, setup.config.noise, log)
+    state = loop.train(step, state, scenes, setup.noise, log)
     steps, seconds = np.subtract(times[-1], times[0]) if times else (0, 0.0)
     return state[0], float(seconds) / max(int(steps), 1)
 
@@ -124,7 +108,7 @@ def _judged(setup: Setup, imager: Callable, parameters: Any) -> dict[str, float]
     """Quality of the images of an arm, by the judge."""
     config, count = setup.config, len(setup.judged.fields)
     patches = _training.thinned(setup.patches.test, config.judge.patches * count)
-    return train.evaluate(imager, parameters, patches, setup.judged, config.noise, 0, count)
+    return train.evaluate(imager, parameters, patches, setup.judged, setup.noise, 0, count)
 
 
 def _one_each(setup: Setup, patches: np.ndarray) -> np.ndarray:
@@ -135,7 +119,7 @@ def _one_each(setup: Setup, patches: np.ndarray) -> np.ndarray:
 def _pictures(setup: Setup, imager: Callable, parameters: Any) -> dict[str, np.ndarray]:
     """Images of the judge, a patch for each of its points."""
     some = _training.textured(setup.patches.test, len(setup.judged.fields))
-    given = _one_each(setup, some), setup.judged, setup.config.noise, 0
+    given = _one_each(setup, some), setup.judged, setup.noise, 0
     return _training.images(imager, parameters, *given)
 
 
@@ -157,7 +141,7 @@ def _decibels(setup: Setup, imager: Callable, parameters: Any, job: str) -> dict
     table = design.draw_perturbations(setup.built, setup.config.judge.builds, SEED + 1)
     patches = _training.thinned(setup.patches.test, len(setup.judged.fields))
     patches, found = _one_each(setup, patches), []
-    noise, key = np.float32(setup.config.noise), jax.random.key(0)
+    noise, key = np.float32(setup.noise), jax.random.key(0)
     for deviations in (np.zeros(table.shape[1]), *tqdm(table, desc=job, leave=False)):
         view = setup.judged._replace(deviations=jnp.asarray(deviations))
         truth, _, image = imager(parameters, patches, view, noise, key)

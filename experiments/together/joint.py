@@ -1,13 +1,17 @@
 """Design a lens and its network together, over field and depth, against a finished lens.
 
-All arms begin with the same spoilt lens: `focus` trains its sensor and the network; `spots` and
-`mtf` finish the lens by least squares, then train the network; `joint` trains all variables and the
-network from the spoilt lens, `joint_from_spots` from the finished one; `damped` is `joint` with
-least-squares steps of the lens on pixels, `rays` and `rays_from_spots` are `joint` and
+Arms begin with the same spoilt lens: `focus` trains its sensor and the network; `spots` and `mtf`
+finish the lens by least squares, then train the network, `longer` with twice the steps; `joint`
+trains all variables and the network from the spoilt lens, `joint_from_spots` from the finished one,
+both by Adam; `cosine_from_spots` with rates that fall; `rays` and `rays_from_spots` are `joint` and
 `joint_from_spots` with steps that are measured by rays; `frozen` trains the lens of `spots` through
-its network; `tolerant` is `joint_from_spots` with lenses as built. Every arm has the same data,
-steps and starts of the network. Another model of the picture judges them: waves, more fields, more
-wavelengths, images that no arm has seen. Writes lenses/ARM SEED.yaml.
+its network; `tolerant` is `joint_from_spots` with lenses as built. With `taps`, the network begins
+with the best linear filter of its lens: `stopped` is `spots` with the best of `stops`, `freed` also
+moves what `held` keeps; `filter` finishes the lens on the error of that filter, and
+`rays_from_filter` goes on jointly. `given` and `rays_from_given` begin with the lens as it is.
+Every arm has the same data, steps and starts of the network. Another model of the picture judges
+them: waves, more fields, more wavelengths, images that no arm has seen. Writes lenses/ARM
+SEED.yaml.
 """
 
 import dataclasses
@@ -46,11 +50,13 @@ class StartErrors:
 @dataclasses.dataclass(frozen=True)
 class Camera:
     """Sensor. pixel_um: side of a pixel. kernel: side of the kernels, pixels, odd. tolerance: sum
-    of the errors of a kernel's pixels in training."""
+    of the errors of a kernel's pixels in training. kind: of the kernels in training, by "rays" or
+    by "waves" (with as many cells as the judge)."""
 
     pixel_um: Annotated[float, within(0.05, 1e4)] = 6.0
     kernel: Annotated[int, within(3, 255), odd] = 21
     tolerance: Annotated[float, within(1e-4, 0.5)] = 0.03
+    kind: Literal["rays", "waves"] = "rays"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -61,8 +67,7 @@ class Training:
     optics_rate: Adam's rate of each variable, as the change of the spots by a step, um.
     rays_um: by how far the first steps of `rays` move the rays, root mean square, um; they become
         shorter as a cosine.
-    damped_rate: part of a full least-squares step that `damped` takes.
-    damped_part: part of the batches that `damped` gets, for equal time.
+    taps_rate: Adam's rate of the taps of the filter.
     """
 
     batches: Annotated[int, within(1, 1e7)] = 400
@@ -71,8 +76,7 @@ class Training:
     points: Annotated[int, within(1, 4096)] = 4
     optics_rate: Annotated[float, within(0, 10)] = 0.1
     rays_um: Annotated[float, within(0, 1e3)] = 1.0
-    damped_rate: Annotated[float, within(0, 10)] = 0.1
-    damped_part: Annotated[float, within(1e-3, 10)] = 1.0
+    taps_rate: Annotated[float, within(0, 10)] = 1e-5
     network_rate: Annotated[float, within(0, 10)] = 1e-3
     checkpoint_every: int = 200
 
@@ -107,7 +111,15 @@ class Config:
     variables, ties, solves, limits: as in experiments.design; `limits` hold in least squares and
         in training.
     field_deg: largest field angle; fields cover the disc.
+    model_glass: surfaces behind which a model glass takes the place of the lens's own, so that
+        "index" and "abbe" can vary.
+    held: kinds of variables that least squares on spots and MTF leave as they are.
+    stops: diameters of the entrance pupil that `stopped` tries, relative to that of the solve
+        `entrance_pupil`; joint arms choose theirs between the smallest and the largest.
     depth_m: nearest and farthest object, .inf for infinity.
+    noise, shot: standard deviation of the read noise, and of the shot noise of white, where the
+        light is that of the whole stop on the axis.
+    taps: side of the filter in front of the network, pixels, odd; 0 for none.
     mtf_at: cycles/mm, of the arm `mtf`.
     arms: of the experiment's description.
     seeds: starts of the network, with data and noise of their own.
@@ -122,12 +134,17 @@ class Config:
     limits: tuple[Operand, ...] = ()
     ties: tuple[Tie, ...] = ()
     solves: tuple[Solve, ...] = ()
+    model_glass: tuple[int, ...] = ()
+    held: tuple[str, ...] = ()
+    stops: Annotated[tuple[float, ...], within(0.01, 1)] = ()
     spoil: StartErrors = StartErrors()
     field_deg: Annotated[float, within(1e-3, 80)] = 10.0
     depth_m: Annotated[tuple[float, ...], near_and_far] = (math.inf, math.inf)
     wavelengths_um: Annotated[Colours, within(0.1, 100)] = (0.6, 0.53, 0.48)
     camera: Camera = Camera()
     noise: Annotated[float, within(0, 10)] = 0.01
+    shot: Annotated[float, within(0, 10)] = 0.0
+    taps: Annotated[int, within(0, 63)] = 0
     mtf_at: Annotated[float, within(1e-3, 1e4)] = 30.0
     network: _settings.Net = _settings.Net()
     train: Training = Training()
@@ -142,8 +159,13 @@ class Config:
     def __post_init__(self) -> None:
         _sharing.require_shared(self.devices, "train.batch", self.train.batch)
         for arm in self.arms:
-            both = ARMS[arm].begins != "spots" or "spots" in self.arms
+            both = not ARMS[arm].frozen or "spots" in self.arms
             _common.require(both, f"arms: {arm} needs spots")
+            taps = ARMS[arm].begins not in ("stopped", "freed", "filter") or self.taps
+            _common.require(taps, f"arms: {arm} needs taps above 0")
+            tries = ARMS[arm].begins not in ("stopped", "freed") or self.stops
+            _common.require(tries, f"arms: {arm} needs stops")
+        _common.require(self.taps % 2 or not self.taps, "taps: expected an odd number, or 0")
         builds = "tolerant" in self.arms or self.judge.builds
         missing = "tolerances: needs at least one item for lenses as built"
         _common.require(bool(self.tolerances) or not builds, missing)

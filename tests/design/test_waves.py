@@ -107,7 +107,7 @@ def test_kernels_are_those_of_psf():
     def beside(x):
         lens = variables.lens_of(x)
         rays = trace_fields(quick(problem), lens)
-        kernels = design.psf(lens, rays, 4e-3, 9)
+        kernels = design.psf(lens, rays, 4e-3, 9).kernel
         return jnp.sum(1 - kernels[:, :, 4, 4]), (kernels, rays.rule)
 
     x = variables.start

@@ -55,7 +55,7 @@ STARTS = {
         ),
         *("spoil.per_cent=1", "field_deg=2", "camera={pixel_um: 20, kernel: 9, tolerance: 0.2}"),
         *("network={layers: 1, channels: 4}", "seeds=1", "mtf_at=1", "data.crops_per_image=4"),
-        "arms=[focus,spots,joint_from_spots,damped,frozen,tolerant]",
+        "arms=[focus,spots,joint_from_spots,rays_from_spots,frozen,tolerant]",
         "train={batches: 12, batch: 2, patch: 8, points: 2, checkpoint_every: 5}",
         "tolerances=[{kind: radius, size: 1}, {kind: tilt, size: 3}]",
         "judge={rings: 2, patches: 1, waves: 2, cells: 64, builds: 3}",
@@ -174,12 +174,12 @@ def checked_joint(results):
 @pytest.mark.slow
 def test_a_joint_run_that_stops_resumes_to_the_same_numbers(tmp_path, monkeypatch):
     own = [key for key in STARTS["joint"] if not key.startswith(("arms", "tolerances", "judge"))]
-    own += ["arms=[spots,damped]", "judge={rings: 2, patches: 1, waves: 2, cells: 64, builds: 0}"]
+    own += ["arms=[spots,rays]", "judge={rings: 2, patches: 1, waves: 2, cells: 64, builds: 0}"]
     experiment, log = importlib.import_module("experiments.joint"), Run.log
 
     def stopping(self, job, step, rows):
         log(self, job, step, rows)
-        if job.startswith("damped") and step == 10:  # after its first checkpoint
+        if job.startswith("rays") and step == 10:  # after its first checkpoint
             raise KeyboardInterrupt
 
     folders = tmp_path / "whole", tmp_path / "stopped"
