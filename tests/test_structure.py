@@ -35,7 +35,8 @@ FLOORS = (
 # Floors that know no ray, and but for `files` no optics formula: all that they may import of the
 # package.
 ALLOWED = {
-    "learn": {"inputs", "numerics", "compilation", "image.kernel", "image.sensor", "image.spot"},
+    "learn": {"inputs", "numerics", "compilation", "devices"}
+    | {"image.kernel", "image.sensor", "image.spot"},
     "files": {"inputs", "numerics", "lens"},
     "show": set(),
 }
@@ -44,12 +45,12 @@ ALLOWED_ALL = {"learn.__init__", "show.layout", "show.analyses", "show.sheet", "
 # Most lines of code of each room; no blank, comment, docstring or import is counted. They
 # fall, and rise only by a new capability, whose commit says by how much: text is free, code is not.
 ROOMS = {
-    "drt_jax": 551,
+    "drt_jax": 554,
     "drt_jax/check": 298,
     "drt_jax/design": 2458,
     "drt_jax/files": 2928,
     "drt_jax/image": 2993,
-    "drt_jax/learn": 645,
+    "drt_jax/learn": 698,
     "drt_jax/lens": 1478,
     "drt_jax/pupil": 776,
     "drt_jax/rays": 1314,

@@ -17,6 +17,7 @@ from ..image.sensor import convolve_each
 from ..inputs import require
 from ..numerics import Numbers
 from .adam import adam, apply_updates, copied
+from .error import Last, Restore, mean_error, restored
 from .train import compiled_step, truth_of
 
 # A function from the optics and object points to kernels (P, C, K, K), and to the light (P, C) on
@@ -36,7 +37,8 @@ class FieldImager:
     """The chain kernels -> sensor layer -> network, for patches anywhere in the field.
 
     points: function that returns kernels and light of object points, for instance by `psf`.
-    restore: (weights, images) -> images; None for a camera without a network.
+    restore: (weights, images) -> images, each from its own image alone; None for a camera without a
+        network.
     convolve: (scenes, kernels) -> images as `convolve_each`, or that function shared by devices.
     dtype: of scenes and images. Kernels are made in the dtype of the lens and cast to it. A network
         of your own must have the same dtype: under `jax_enable_x64` libraries make their weights in
@@ -44,7 +46,7 @@ class FieldImager:
     """
 
     points: Points
-    restore: Callable[[Any, Array], Array] | None = None
+    restore: Restore | None = None
     convolve: Callable[[Array, Array], Array] = convolve_each
     dtype: Any = jnp.float32
 
@@ -80,16 +82,19 @@ class FieldImager:
         seen: "ObjectPoints",
         noise: Numbers,
         key: Array,
+        last: Last = restored,
     ) -> tuple[Array, Array, Array]:
         """True, sensor and restored images (B, H, W, C), in the dtype of the imager.
 
         parameters: "optics", and "network" for a network.
         scenes: uint8 (B, H + K - 1, W + K - 1, C).
         seen, noise, key: as in `sensor`.
+        last: what takes the place of the restored images, such as `mean_error`, ().
         """
         real = scenes.astype(self.dtype) / 255
         image = self.sensor(parameters["optics"], real, seen, noise, key)
-        return truth_of(real, image), image, self._restored(parameters, image)
+        truth = truth_of(real, image)
+        return truth, image, last(self.restore, parameters.get("network"), image, truth)
 
     def _restored(self, parameters: dict[str, Any], image: Array) -> Array:
         """The images that the network restores."""
@@ -207,8 +212,7 @@ def make_field_step(
         seen, noise_key = _drawn(draw, seed, index)
 
         def loss(parameters):
-            truth, _, restored = imager(parameters, scenes, seen, noise, noise_key)
-            return jnp.mean(jnp.abs(restored - truth))
+            return imager(parameters, scenes, seen, noise, noise_key, last=mean_error)[2]
 
         error, gradients = jax.value_and_grad(loss)(parameters)
         updates, moments = update(_weights(gradients), moments)

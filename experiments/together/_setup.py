@@ -231,7 +231,7 @@ class Setup:
         self, stays: bool, steps: str, frozen: bool, as_built: bool
     ) -> tuple[Callable, Callable]:
         """(init, step); stays: True for a lens that stays, the others as in `Arm`."""
-        setting, restore = self.config.train, shared(self.restore, self.mesh, 1)
+        setting, mesh = self.config.train, self.mesh
         rates: dict[str, Any] = {"network": setting.network_rate, "optics": 0.0}
         if steps == "damped":
             rates["optics"] = setting.damped_rate
@@ -246,7 +246,7 @@ class Setup:
             return self.points(jax.lax.stop_gradient(optics) if stays else optics, seen)
 
         def restored(weights: Any, image: Array) -> Array:
-            return restore(jax.lax.stop_gradient(weights) if frozen else weights, image)
+            return self.restore(jax.lax.stop_gradient(weights) if frozen else weights, image)
 
         def draw(key: Array) -> ObjectPoints:
             seen = draw_points(key, setting.points, self.field, self.depths)
@@ -262,7 +262,7 @@ class Setup:
             vector = jnp.where(before.get("moves", True), after["lens"], before["lens"])
             return before | {"lens": design.within_limits(self.limits, before["lens"], vector)}
 
-        imager = FieldImager(points, restored, shared(learn.convolve_each, self.mesh))
+        imager = FieldImager(points, shared(restored, mesh, 1), shared(learn.convolve_each, mesh))
         make = make_damped_step if steps == "damped" else make_field_step
         return make(imager, rates, draw, 0, hold)
 
