@@ -5,6 +5,7 @@ terms: JAX's pages on `jax.sharding` and `jax.shard_map`.
 """
 
 import concurrent.futures
+import dataclasses
 import os
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
@@ -54,6 +55,22 @@ def device_mesh(count: int) -> Mesh:
     return jax.make_mesh((count,), ("rows",), axis_types=(AxisType.Auto,), devices=chosen)
 
 
+@dataclasses.dataclass(frozen=True)
+class Shared:
+    """A function whose work the devices of a mesh share, with the arguments of `shared`."""
+
+    function: Callable
+    mesh: Mesh
+    whole: int
+
+    def __call__(self, *arguments: Any) -> Any:
+        rows, copy = PartitionSpec(*self.mesh.axis_names), PartitionSpec()
+        specs = tuple(copy if k < self.whole else rows for k in range(len(arguments)))
+        return jax.shard_map(
+            self.function, mesh=self.mesh, in_specs=specs, out_specs=rows, check_vma=False
+        )(*arguments)
+
+
 def shared(function: Callable, mesh: Mesh | None, whole: int = 0) -> Callable:
     """A function whose work the devices of a mesh share.
 
@@ -66,17 +83,7 @@ def shared(function: Callable, mesh: Mesh | None, whole: int = 0) -> Callable:
     whole: number of leading arguments that every device gets whole. The first axis of all others is
         a multiple of the number of devices.
     """
-    if mesh is None:
-        return function
-    rows, copy = PartitionSpec(*mesh.axis_names), PartitionSpec()
-
-    def call(*arguments: Any) -> Any:
-        specs = tuple(copy if k < whole else rows for k in range(len(arguments)))
-        return jax.shard_map(function, mesh=mesh, in_specs=specs, out_specs=rows, check_vma=False)(
-            *arguments
-        )
-
-    return call
+    return function if mesh is None else Shared(function, mesh, whole)
 
 
 def split(mesh: Mesh | None, tree: Any) -> Any:

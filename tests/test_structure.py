@@ -35,15 +35,8 @@ FLOORS = (
 # Floors that know no ray, and but for `files` no optics formula: all that they may import of the
 # package.
 ALLOWED = {
-    "learn": {
-        "inputs",
-        "numerics",
-        "compilation",
-        "image.kernel",
-        "image.sensor",
-        "image.spot",
-        "image.wiener",
-    },
+    "learn": {"inputs", "numerics", "compilation", "devices"}
+    | {f"image.{name}" for name in ("kernel", "sensor", "spot", "wiener")},
     "files": {"inputs", "numerics", "lens"},
     "show": set(),
 }
@@ -52,12 +45,12 @@ ALLOWED_ALL = {"learn.__init__", "show.layout", "show.analyses", "show.sheet", "
 # Most lines of code of each room; no blank, comment, docstring or import is counted. They
 # fall, and rise only by a new capability, whose commit says by how much: text is free, code is not.
 ROOMS = {
-    "drt_jax": 551,
+    "drt_jax": 554,
     "drt_jax/check": 298,
     "drt_jax/design": 2474,
     "drt_jax/files": 2928,
-    "drt_jax/image": 3039,
-    "drt_jax/learn": 602,
+    "drt_jax/image": 3040,
+    "drt_jax/learn": 656,
     "drt_jax/lens": 1478,
     "drt_jax/pupil": 776,
     "drt_jax/rays": 1314,
@@ -68,7 +61,7 @@ ROOMS = {
     "experiments/paper": 608,
     "experiments/runs": 453,
     "experiments/speed": 1432,
-    "experiments/together": 418,
+    "experiments/together": 497,
     "experiments/trust": 1992,
 }
 PUBLIC = 60

@@ -2,7 +2,8 @@
 
 Data: `load_patches`, `batches`. One blur for all patches, as in the paper: `make_imager`,
 `make_step`. Object points anywhere in the field: `FieldImager`, `draw_points`, `make_field_step`.
-The best linear filter of a lens: `power_of`, `wiener`, `filtered`. The loop: `fit`, `evaluate`.
+The loss of both: `mean_error`. The best linear filter of a lens: `power_of`, `wiener`, `filtered`.
+The loop: `fit`, `evaluate`.
 """
 
 from ..image.depth import depth_moments as depth_moments, moments_model as moments_model
@@ -26,6 +27,7 @@ from .data import (
     batches as batches,
     load_patches as load_patches,
 )
+from .error import mean_error as mean_error
 from .field import (
     FieldImager as FieldImager,
     ObjectPoints as ObjectPoints,

@@ -16,6 +16,7 @@ from ..image.sensor import convolve_each, noise_of
 from ..inputs import require
 from ..numerics import Numbers
 from .adam import adam, apply_updates, copied
+from .error import Last, Restore, mean_error, restored
 from .train import compiled_step, truth_of
 
 # A function from the optics and object points to kernels (P, C, K, K), and to the light (P, C) on
@@ -30,7 +31,8 @@ class FieldImager:
     """The chain kernels -> sensor layer -> network, for patches anywhere in the field.
 
     points: function that returns kernels and light of object points, for instance by `psf`.
-    restore: (weights, images) -> images; None for a camera without a network.
+    restore: (weights, images) -> images, each from its own image alone; None for a camera without a
+        network.
     convolve: (scenes, kernels) -> images as `convolve_each`, or that function shared by devices.
     dtype: of scenes and images. Kernels are made in the dtype of the lens and cast to it. A network
         of your own must have the same dtype: under `jax_enable_x64` libraries make their weights in
@@ -38,7 +40,7 @@ class FieldImager:
     """
 
     points: Points
-    restore: Callable[[Any, Array], Array] | None = None
+    restore: Restore | None = None
     convolve: Callable[[Array, Array], Array] = convolve_each
     dtype: Any = jnp.float32
 
@@ -74,6 +76,7 @@ class FieldImager:
         seen: "ObjectPoints",
         noise: Numbers,
         key: Array,
+        last: Last = restored,
     ) -> tuple[Array, Array, Array]:
         """True, sensor and restored images (B, H, W, C), in the dtype of the imager: of all, the
         part that the network restores, such as the middle.
@@ -81,12 +84,14 @@ class FieldImager:
         parameters: "optics", and "network" for a network.
         scenes: uint8 (B, H + K - 1, W + K - 1, C).
         seen, noise, key: as in `sensor`.
+        last: what takes the place of the restored images, such as `mean_error`, ().
         """
         real = scenes.astype(self.dtype) / 255
         image = self.sensor(parameters["optics"], real, seen, noise, key)
-        restore = self.restore
-        found = image if restore is None else restore(parameters.get("network"), image)
-        return truth_of(real, found), truth_of(image, found), found
+        restore, weights = self.restore, parameters.get("network")
+        found = image if restore is None else jax.eval_shape(restore, weights, image)
+        truth = truth_of(real, found)
+        return truth, truth_of(image, found), last(restore, weights, image, truth)
 
 
 class ObjectPoints(NamedTuple):
@@ -199,8 +204,7 @@ def make_field_step(
         seen, noise_key = _drawn(draw, seed, index)
 
         def loss(parameters):
-            truth, _, restored = imager(parameters, scenes, seen, noise, noise_key)
-            return jnp.mean(jnp.abs(restored - truth))
+            return imager(parameters, scenes, seen, noise, noise_key, last=mean_error)[2]
 
         error, gradients = jax.value_and_grad(loss)(parameters)
         updates, moments = update(_weights(gradients), moments)

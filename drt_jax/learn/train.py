@@ -17,10 +17,10 @@ from ..image.spot import Moments
 from ..inputs import require
 from ..numerics import Numbers, safe_divide, safe_sqrt
 from .adam import adam, apply_updates, copied
+from .error import Last, Restore, mean_error, restored
 from .network import count_parameters
 
 Blur = Callable[[dict[str, Array], Array], Moments]
-Restore = Callable[[Any, Array], Array]
 Imager = Callable[..., tuple[Array, Array, Array, Array]]
 
 
@@ -55,7 +55,8 @@ def make_imager(
     """The chain moments -> PSF -> sensor layer -> network as one function.
 
     blur: a function that `moments_model` returns.
-    restore: (parameters, images) -> images; None for a camera without a network.
+    restore: (parameters, images) -> images, each from its own image alone; None for a camera
+        without a network.
     camera: constants of the sensor layer.
     convolve: `convolve`; or `convolve_taps` for values and forward mode, which `make_step` uses
         where a single number is trained.
@@ -63,13 +64,19 @@ def make_imager(
 
     The function maps (parameters {"optics", "network"}, scenes uint8 (B, H + K - 1, W + K - 1, C),
     distance in mm, noise, key) to the true, the sensor and the restored image (B, H, W, C), of this
-    dtype, and to the standard deviation (C,) of the blur in mm. The kernel is centred on the mean
-    centroid of the wavelengths that arrive, so that images are registered. Each channel is
-    multiplied by the throughput of its wavelength.
+    dtype, and to the standard deviation (C,) of the blur in mm. With `last=mean_error` that error,
+    (), takes the place of the restored image. The kernel is centred on the mean centroid of the
+    wavelengths that arrive, so that images are registered. Each channel is multiplied by the
+    throughput of its wavelength.
     """
 
     def imager(
-        parameters: dict[str, Any], scenes: Array, distance: Array, noise: Numbers, key: Array
+        parameters: dict[str, Any],
+        scenes: Array,
+        distance: Array,
+        noise: Numbers,
+        key: Array,
+        last: Last = restored,
     ) -> tuple[Array, Array, Array, Array]:
         scenes = scenes.astype(dtype) / 255
         spot = blur(parameters["optics"], distance)
@@ -81,8 +88,9 @@ def make_imager(
         kernel = psf(offset, spot.covariance, pixel, camera.kernel, camera.form)
         throughput = jnp.expand_dims(spot.throughput.astype(dtype), (0, 1, 2))
         image = sensor_layer(scenes * throughput, kernel, noise, key, convolve)
-        restored = image if restore is None else restore(parameters["network"], image)
-        return truth_of(scenes, image), image, restored, blur_width(spot.covariance)
+        truth = truth_of(scenes, image)
+        found = last(restore, parameters.get("network"), image, truth)
+        return truth, image, found, blur_width(spot.covariance)
 
     return imager
 
@@ -131,7 +139,7 @@ def make_step(
 ) -> tuple[Callable, Callable]:
     """Adam on the mean absolute error as (init, step).
 
-    imager: a function that `make_imager` returns.
+    imager: a function that `make_imager` returns, or of the same arguments, `last` among them.
     rates: learning rates of "optics" and "network", see `adam`, in the unit of each parameter.
     depths: limits of the object distance, which is uniform in each step, mm.
     seed: noise and distance depend only on it and on the index of the step.
@@ -156,8 +164,8 @@ def make_step(
         distance = near + (far - near) * distance
 
         def loss(parameters):
-            truth, _, restored, sigma = imager(parameters, scenes, distance, noise, noise_key)
-            return jnp.mean(jnp.abs(restored - truth)), jnp.mean(sigma)
+            found = imager(parameters, scenes, distance, noise, noise_key, last=mean_error)
+            return found[2], jnp.mean(found[3])
 
         (error, sigma), gradients = _value_and_gradient(loss, parameters)
         updates, moments = update(gradients, moments)
@@ -235,8 +243,8 @@ def evaluate(
         filled = np.concatenate([part, np.zeros((batch - len(part), *part.shape[1:]), np.uint8)])
         key = jax.random.fold_in(jax.random.key(seed), start)
         images = imager(parameters, filled, distance, np.float32(noise), key)[:3]
-        for truth, sensor, restored in zip(*(np.asarray(a)[: len(part)] for a in images)):
-            rows.append(_quality(truth, restored, "") | _quality(truth, sensor, "sensor_"))
+        for truth, sensor, image in zip(*(np.asarray(a)[: len(part)] for a in images)):
+            rows.append(_quality(truth, image, "") | _quality(truth, sensor, "sensor_"))
     means = {name: float(np.mean([row[name] for row in rows])) for name in rows[0]}
     for prefix in ("", "sensor_"):
         means[prefix + "rmse"] = means.pop(prefix + "mse") ** 0.5

@@ -266,8 +266,8 @@ def network_task(config: Config) -> list[Row]:
     shape = (config.batch, config.patch, config.patch, 3)
     images, truth = (jnp.asarray(rng.random(shape), jnp.float32) for _ in range(2))
 
-    def network_alone(parameters, *_):
-        return truth, images, apply(parameters["network"], images), jnp.zeros(3)
+    def network_alone(parameters, *_, last):
+        return truth, images, last(apply, parameters["network"], images, truth), jnp.zeros(3)
 
     only, _ = adam_step(network_alone, {"optics": {}, "network": weights})
     sensor = train.make_imager(blur, None, camera)

@@ -310,7 +310,7 @@ class Setup:
         self, stays: bool, steps: str, frozen: bool, as_built: bool
     ) -> tuple[Callable, Callable]:
         """(init, step); stays: True for a lens that stays, the others as in `Arm`."""
-        setting, restore = self.config.train, shared(self.restore, self.mesh, 1)
+        setting, mesh = self.config.train, self.mesh
         rates: dict[str, Any] = {"network": setting.network_rate, "optics": 0.0}
         if self.config.taps:
             rates["network"] = {"taps": setting.taps_rate, "network": setting.network_rate}
@@ -329,7 +329,7 @@ class Setup:
             return self.points(jax.lax.stop_gradient(optics) if stays else optics, seen)
 
         def restored(weights: Any, image: Array) -> Array:
-            return restore(jax.lax.stop_gradient(weights) if frozen else weights, image)
+            return self.restore(jax.lax.stop_gradient(weights) if frozen else weights, image)
 
         def draw(key: Array) -> ObjectPoints:
             seen = draw_points(key, setting.points, self.field, self.depths)
@@ -345,7 +345,7 @@ class Setup:
             vector = jnp.where(before.get("moves", True), after["lens"], before["lens"])
             return before | {"lens": design.within_limits(self.limits, before["lens"], vector)}
 
-        imager = FieldImager(points, restored, shared(learn.convolve_each, self.mesh))
+        imager = FieldImager(points, shared(restored, mesh, 1), shared(learn.convolve_each, mesh))
         return make_field_step(imager, rates, draw, 0, hold)
 
     def start(self, arm: Arm, seed: int, vector: Array, weights: Any) -> dict[str, Any]:

@@ -19,12 +19,23 @@ def plain(images, kernel):
     )
 
 
-# Winograd's, and gathered.
-@pytest.fixture(scope="module", params=[(2, 32, 36, 32), (3, 9, 20, 32)], ids=["large", "small"])
+# Winograd's, all images at once and one by one, also of sides that are no multiples of 4; gathered;
+# and few channels in or out.
+CASES = {
+    "large": ((2, 32, 36, 32), 32),
+    "odd": ((2, 65, 34, 32), 32),
+    "small": ((3, 9, 20, 32), 32),
+    "few in": ((2, 64, 33, 3), 32),
+    "few out": ((2, 64, 33, 32), 3),
+}
+
+
+@pytest.fixture(scope="module", params=CASES.values(), ids=CASES)
 def case(request):
+    shape, out = request.param
     rng = np.random.default_rng(0)
-    images, kernel = rng.standard_normal(request.param), rng.standard_normal((3, 3, 32, 32)) / 17
-    return images, kernel, rng.standard_normal(images.shape)
+    images, kernel = rng.standard_normal(shape), rng.standard_normal((3, 3, shape[-1], out)) / 17
+    return images, kernel, rng.standard_normal((*shape[:3], out))
 
 
 @pytest.mark.parametrize("dtype, bound", [(jnp.float64, 1e-13), (jnp.float32, 5e-6)])
@@ -48,7 +59,7 @@ def test_value_and_gradients(case, dtype, bound):
 
 
 @pytest.mark.parametrize(
-    "shape, out", [((1, 32, 33, 32), 32), ((1, 32, 32, 3), 32), ((2, 8, 8, 40), 40)]
+    "shape, out", [((1, 65, 64, 16), 16), ((1, 32, 32, 32), 40), ((2, 8, 8, 40), 40)]
 )
 def test_other_shapes(shape, out):
     rng = np.random.default_rng(1)

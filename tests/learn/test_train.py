@@ -158,7 +158,7 @@ def test_network_stays_in_float32():
     products = [
         line
         for line in text.splitlines()
-        if ("dot_general" in line or "convolution" in line) and "tensor<16x16x" in line
+        if ("dot_general" in line or "convolution" in line) and "tensor<3x16x16x" in line
     ]
     assert products and all("xf32>" in line and "f64" not in line for line in products)
     (parameters, _), _ = step(state, scenes(), np.float32(0), np.int32(0))
