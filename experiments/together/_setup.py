@@ -76,7 +76,9 @@ ARMS = {
     "filter": Arm("(g) least squares on the filter's error, then network", "filter", "nothing"),
     "rays_from_filter": Arm("(h) jointly from (g), steps of rays", "filter", steps="rays"),
     "rays_from_given": Arm("(h) jointly from (a), steps of rays", "given", steps="rays"),
-    "tolerant": Arm("(e) with lenses as built", "spots", as_built=True),
+    "tolerant": Arm(
+        "(e) with steps of rays and lenses as built", "spots", steps="rays", as_built=True
+    ),
 }
 # Of each finished lens the one that it begins with.
 _BEFORE = {"spots": "spoilt", "mtf": "spots", "stopped": "spots", "freed": "stopped"}
@@ -180,7 +182,7 @@ class Setup:
         if name in ("given", "spoilt"):
             return self.spoilt if name == "spoilt" else self.variables.start
         if name not in self._finished:
-            best = "stopped" if self.config.stops else "spots"
+            best = "freed" if self.config.stops else "spots"
             before = self.finished(_BEFORE.get(name, best), once)
 
             def finish() -> list[float]:
