@@ -210,10 +210,10 @@ class Setup:
             return best(self._problem(self._variables(lens, held), "spot"))
         stops = {s: self._variables(lens, held, s) for s in self.config.stops}
         found = [best(self._problem(own, "spot")) for own in stops.values()]
-        errors = [float(self.filtered.merit(vector)) for vector in found]
-        for stop, error in zip(stops, errors):
-            print(f"stop {stop:g}: {-10 * math.log10(error / 3):.2f} dB behind the filter")
-        return found[int(np.argmin(errors))]
+        reached = [self.filter_db(vector) for vector in found]
+        for stop, db in zip(stops, reached):
+            print(f"stop {stop:g}: {db:.2f} dB behind the filter")
+        return found[int(np.argmax(reached))]
 
     @functools.cached_property
     def rates(self) -> Array:
@@ -375,6 +375,11 @@ class Setup:
             return found.taps.astype(jnp.float32)
 
         return jax.jit(taps)
+
+    def filter_db(self, vector: Array) -> float | None:
+        """PSNR behind the best filter by its closed-form error, dB; None without a filter."""
+        error = float(self.filtered.merit(vector)) if self.config.taps else None
+        return error and -10 * math.log10(error / len(self.waves))
 
     def spot_um(self, vector: Array) -> float:
         """RMS radius of the spots of all fields and depths, um."""

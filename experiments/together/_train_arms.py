@@ -64,6 +64,7 @@ def run(config: Any, run: Run) -> dict[str, Any]:
         "arms": arms,
         "losses": losses,
         "start_um": {name: setup.spot_um(vector) for name, vector in lenses.items()},
+        "filter_db": {name: setup.filter_db(vector) for name, vector in lenses.items()},
         "builds": _as_built(setup, run, trained) if config.judge.builds else [],
         "drawn": ["spoilt", *(jobs[arm, 0] for arm in arms)],
         "pictures": arms,
