@@ -102,8 +102,12 @@ class Setup:
         self._steps: dict[tuple, tuple[Callable, Callable]] = {}
         self._finished: dict[str, Array] = {}
         lens = design.open_apertures(drt_jax.load_lens(config.lens))
-        if config.model_glass:
-            lens = drt_jax.with_model_glass(lens, config.model_glass)
+        try:
+            lens = (
+                drt_jax.with_model_glass(lens, config.model_glass) if config.model_glass else lens
+            )
+        except ValueError as error:
+            raise ConfigError(f"model_glass: {error}") from error
         self.noise = (config.noise, config.shot)[: 1 + bool(config.shot)]
         self.waves = np.array(config.wavelengths_um)
         self.pixels = 1e-3 * config.camera.pixel_um, config.camera.kernel

@@ -167,7 +167,8 @@ def checked_joint(results):
     assert rows["spots"]["spot_um"] == pytest.approx(results["start_um"]["spots"])
     assert rows["tolerant"]["spot_um"] != rows["spots"]["spot_um"] < results["start_um"]["spoilt"]
     assert [len(loss) for loss in results["losses"]] == [12] * 6
-    assert [row["arm"] for row in results["builds"]] == ["spots", "joint_from_spots", "tolerant"]
+    built = ["spots", "joint_from_spots", "rays_from_spots", "tolerant"]
+    assert [row["arm"] for row in results["builds"]] == built
     assert all(row["low"] <= row["mean"] for row in results["builds"])
 
 
@@ -196,6 +197,28 @@ def test_a_joint_run_that_stops_resumes_to_the_same_numbers(tmp_path, monkeypatc
     assert whole == resumed
 
 
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:size: ")
+def test_a_filter_in_front_of_the_network_and_the_best_stop(tmp_path):
+    """Least squares on the error of the filter find a better lens for it than those on spots."""
+    own = [key for key in STARTS["joint"] if not key.startswith(("arms", "tol", "judge", "var"))]
+    own += [
+        "variables=[{kind: curvature}, {kind: sensor}, {kind: abbe, low: 30, high: 80}]",
+        *("model_glass=[1]", "held=[abbe]", "stops=[1, 0.7]", "taps=9", "shot=0.02"),
+        "solves=[{kind: entrance_pupil, value: 10}]",
+        *("camera.kind=waves", "train.patch=48"),
+        "arms=[stopped, freed, filter, rays_from_filter]",
+        "judge={rings: 2, patches: 1, waves: 2, cells: 64}",
+    ]
+    experiment = importlib.import_module("experiments.joint")
+    _command.main(experiment, ["--out", str(tmp_path), "--set", *own])
+    results = json.loads((tmp_path / "results.json").read_text())
+    behind = results["filter_db"]
+    assert behind["filter"] > 1 + max(behind[name] for name in ("stopped", "freed")), behind
+    assert len(results["rows"]) == 4 and all(0 < row["mae"] < 0.6 for row in results["rows"])
+    assert len(experiment.tables(results)) == 2
+
+
 @pytest.mark.parametrize(
     "change, told",
     [
@@ -211,6 +234,10 @@ def test_a_joint_run_that_stops_resumes_to_the_same_numbers(tmp_path, monkeypatc
         ),
         ("train.batch=3", "train.batch: expected a multiple of train.points"),
         ("arms=[frozen]", "arms: frozen needs spots"),
+        ("arms=[filter]", "arms: filter needs taps above 0"),
+        ("arms=[freed]", "arms: freed needs"),
+        ("model_glass=[0]", "model_glass: surfaces: no glass begins behind surface 0"),
+        ("taps=4", "taps: expected an odd number, or 0"),
         ("variables=[{kind: conic, surfaces: [9]}]", "variables: conic: no surface 9"),
         ("judge.builds=5", "tolerances: needs at least one item"),
         ("depth_m=[5, 1]", "depth_m: expected the nearest and the farthest"),
