@@ -72,6 +72,7 @@ ARMS = {
     "joint_from_spots": Arm("(e) jointly from (b), Adam", "spots"),
     "cosine_from_spots": Arm("(e) with Adam, rates as a cosine", "spots", steps="cosine"),
     "rays_from_spots": Arm("(e) with steps of rays", "spots", steps="rays"),
+    "rays_from_mtf": Arm("(e) from (c), with steps of rays", "mtf", steps="rays"),
     "frozen": Arm("(f) lens of (b) through its frozen network", "spots", frozen=True),
     "filter": Arm("(g) least squares on the filter's error, then network", "filter", "nothing"),
     "rays_from_filter": Arm("(h) jointly from (g), steps of rays", "filter", steps="rays"),
