@@ -210,11 +210,14 @@ def _spread(values: list[float], digits: int) -> str:
 def draw(results: dict[str, Any], figures: pathlib.Path) -> None:
     """Draws losses, lenses, and patches through each lens before and after the network."""
     titles = {name: arm.title for name, arm in ARMS.items()}
-    with _plots.picture(figures / "losses.png", 7, 4.5) as (ax,):
-        losses = zip(results["arms"], results["losses"])
-        lines = {titles[arm]: _smooth(loss) for arm, loss in losses}
-        _plots.curves(ax, lines, "training batch", "mean absolute error")
-        ax.set_yscale("log")
+    seconds = {row["arm"]: row["step_s"] for row in results["rows"]}  # of the last seed
+    lines = {arm: _smooth(loss) for arm, loss in zip(results["arms"], results["losses"])}
+    with _plots.picture(figures / "losses.png", 6.5, 4.5, 2) as axes:
+        for ax, label, scale in zip(axes, ("training batch", "seconds"), ({}, seconds)):
+            own = {titles[a]: (scale.get(a, 1) * x, y) for a, (x, y) in lines.items()}
+            _plots.curves(ax, own, label, "mean absolute error")
+            ax.set_yscale("log")
+        axes[1].get_legend().remove()
     drawn = results["drawn"]
     fields = np.radians([0.0, 0.7 * results["field_deg"], results["field_deg"]])
     scene = Scene.radians(fields, results["far_mm"] or math.inf)
