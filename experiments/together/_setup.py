@@ -89,7 +89,7 @@ class Setup:
     """What all arms of a run share.
 
     variables: of the lens, with open apertures.
-    spots: problem of least squares on spots, with the variables that it moves.
+    spots: problem of spots, whose rays measure steps.
     limits: problem whose limits hold in training.
     spoilt: (N,), vector of the spoilt lens.
     patches: training and test patches.
@@ -115,11 +115,8 @@ class Setup:
         self.field = math.radians(config.field_deg)
         self.depths = tuple(1e3 * d for d in config.depth_m)
         self.variables = self._variables(lens, free=True)
-        self.spots = self._problem(self._variables(lens, config.held), "spot")
-        self._all_spots = self._problem(self.variables, "spot")
-        self.limits = self._all_spots
-        if config.limits:
-            self.limits = self._problem(self.variables)
+        self.spots = self._problem(self.variables, "spot")
+        self.limits = self._problem(self.variables) if config.limits else self.spots
         spoil = config.spoil
         errors = spoil.per_cent, spoil.off_mm, spoil.seed
         vector = design.as_built_starts(self.variables, 1, *errors)[0]
@@ -208,11 +205,10 @@ class Setup:
 
         if name == "filter":
             return best(self.filtered, _JACOBIANS)
-        if name == "mtf":
+        if name in ("spots", "mtf"):
             sharp = design.Operand("mtf", target=1.0, at=self.config.mtf_at)
-            return best(self._problem(self._variables(lens, held), sharp))
-        if name == "spots":
-            return best(self._problem(self._variables(lens, held), "spot"))
+            aim = {"spots": "spot", "mtf": sharp}[name]
+            return best(self._problem(self._variables(lens, held), aim))
         stops = {s: self._variables(lens, held, s) for s in self.config.stops}
         found = [best(self._problem(own, "spot")) for own in stops.values()]
         reached = [self.filter_db(vector) for vector in found]
@@ -224,7 +220,7 @@ class Setup:
     def rates(self) -> Array:
         """Adam's rate of each variable: at the spoilt lens it changes the spots by as much as all
         others, `train.optics_rate`, root mean square over rays, fields and depths."""
-        tried = quick(self._all_spots)
+        tried = quick(self.spots)
         search = take_step(tried, init_problem(tried, self.spoilt))
         rows = search.residuals.size - search.evaluation.constraints.size
         views = len(tried.fields) * len(tried.distances)
@@ -323,7 +319,7 @@ class Setup:
             rates["network"] = {"taps": setting.taps_rate, "network": setting.network_rate}
         if steps == "rays":
             size = design.cosine(1e-3 * setting.rays_um, setting.batches)
-            rates["optics"] = design.RaySteps(self._all_spots, self.limits, size)
+            rates["optics"] = design.RaySteps(self.spots, self.limits, size)
         elif not stays:
             falls = design.cosine(1.0, setting.batches, 1)
             lens: Any = self.rates
@@ -388,5 +384,5 @@ class Setup:
 
     def spot_um(self, vector: Array) -> float:
         """RMS radius of the spots of all fields and depths, um."""
-        views = len(self._all_spots.fields) * len(self._all_spots.distances)
-        return 1e3 * math.sqrt(float(self._all_spots.merit(vector)) / views)
+        views = len(self.spots.fields) * len(self.spots.distances)
+        return 1e3 * math.sqrt(float(self.spots.merit(vector)) / views)
