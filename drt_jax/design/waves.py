@@ -148,8 +148,8 @@ def filter_error(
 
     def residuals(lens: Lens, rays: FieldRays) -> Array:
         seen = psf(lens, rays, pixel, size, kind, cells)
-        full = jnp.asarray(light, seen.solid_angle.dtype)
-        grain = noise_of(noise, seen.solid_angle / full[None], _MEAN)
+        full = jnp.broadcast_to(jnp.asarray(light), seen.solid_angle.shape)
+        grain = noise_of(noise, seen.solid_angle / full, _MEAN)
         return safe_sqrt(wiener(seen.kernel, grain, power, 1).error).ravel()
 
     return residuals

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import drt_jax
-from drt_jax import Clipped, Gauss, Pattern, Scene, Soft, design, load_lens
+from drt_jax import Clipped, Gauss, Pattern, Scene, Soft, design, learn, load_lens
 from drt_jax.compilation import LARGE, jit
 from drt_jax.design import Operand, Problem, Variables, Vary, trace_fields
 from drt_jax.design.problem import quick
@@ -127,6 +127,30 @@ def test_kernels_are_those_of_psf():
     with pytest.raises(ValueError, match="^rule: needs Gauss, Soft or Clipped of"):
         low = Problem.from_variables(variables, ["spot"], Scene.radians(FIELDS), 1)
         jax.eval_shape(lambda lens: design.psf(lens, trace_fields(low, lens), 4e-3), COOKE)
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:size.* hold 99 %")
+def test_the_error_behind_the_filter_is_that_of_kernels_of_psf():
+    variables = Variables.from_lens(COOKE, ["sensor"])
+    scene, pixel, size = Scene.radians(FIELDS, wavelengths=COLOURS), 6e-3, 15
+    waves = drt_jax.Sampling("waves", beam_rule(10, "none"), 64)
+    axis = drt_jax.psf(COOKE, Scene.point(wavelengths=COLOURS), pixel, size, sampling=waves)
+    line = np.minimum(np.fft.fftfreq(32)[:, None] ** 2 + np.fft.rfftfreq(32)[None] ** 2, 1.0)
+    power = (1e-3 / (line + 1e-3))[..., None, None] * (0.2 + 0.8 * np.eye(len(COLOURS)))
+    error = design.filter_error(power, 0.02, axis.solid_angle, pixel, size)
+    problem = Problem.from_variables(variables, [design.Operand(error)], scene, 6)
+    both = jit(jax.value_and_grad(problem.merit), LARGE)
+    x = variables.start
+    found, slope = both(x)
+    points = Scene.radians(jnp.stack([0 * FIELDS, FIELDS], -1), wavelengths=COLOURS)
+    seen = drt_jax.psf(COOKE, points, pixel, size, sampling=waves)
+    grain = 0.02 * axis.solid_angle[None] / seen.solid_angle
+    wanted = float(jnp.sum(learn.wiener(seen.kernel, grain, power, 1).error))
+    assert float(found) == pytest.approx(wanted, rel=2e-3)
+    step = 1e-4
+    ends = [float(both(x + h)[0]) for h in (step, -step)]
+    assert float(slope[0]) == pytest.approx((ends[0] - ends[1]) / (2 * step), rel=1e-4)
 
 
 @pytest.mark.slow
