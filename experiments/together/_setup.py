@@ -116,7 +116,10 @@ class Setup:
         self.depths = tuple(1e3 * d for d in config.depth_m)
         self.variables = self._variables(lens, free=True)
         self.spots = self._problem(self.variables, "spot")
-        self.limits = self._problem(self.variables) if config.limits else self.spots
+        # Edges and thicknesses ask for rays of the rim alone.
+        of_rays = any("fields" in design.OPERANDS[o.kind].names for o in config.limits)
+        order = _ORDER if of_rays else 2
+        self.limits = self._problem(self.variables, order=order) if config.limits else self.spots
         spoil = config.spoil
         errors = spoil.per_cent, spoil.off_mm, spoil.seed
         vector = design.as_built_starts(self.variables, 1, *errors)[0]
@@ -166,7 +169,9 @@ class Setup:
             vary.append(design.Vary("semi_diameter", (lens.stop,), (), 0.05 * own, 2 * own))
         return design.Variables.from_lens(lens, vary, config.ties, solves)
 
-    def _problem(self, variables: design.Variables, *operands: Any) -> design.Problem:
+    def _problem(
+        self, variables: design.Variables, *operands: Any, order: int = _ORDER
+    ) -> design.Problem:
         near, far = (1 / d for d in self.depths)
         parts = np.unique(np.linspace(near, far, 1 if near == far else _DEPTHS))
         distances = [1 / p if p > 0 else math.inf for p in parts]
@@ -174,7 +179,7 @@ class Setup:
         fields, weights = np.arctan(np.tan(self.field) * rings), [1.0] * _RINGS + [_EDGE]
         scene = Scene.grid(fields, distances, self.waves, field_weights=weights)
         both = (*operands, *self.config.limits)
-        return design.Problem.from_variables(variables, both, scene, _ORDER)
+        return design.Problem.from_variables(variables, both, scene, order)
 
     def finished(self, name: str, once: Callable[[str, Callable[[], list]], list]) -> Array:
         """The vector of a lens at the start of an arm: "given", "spoilt", or what least squares
