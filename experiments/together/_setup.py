@@ -77,6 +77,7 @@ ARMS = {
     "filter": Arm("(g) least squares on the filter's error, then network", "filter", "nothing"),
     "rays_from_filter": Arm("(h) jointly from (g), steps of rays", "filter", steps="rays"),
     "rays_from_given": Arm("(h) jointly from (a), steps of rays", "given", steps="rays"),
+    "built_network": Arm("(b) with lenses as built", "spots", "nothing", as_built=True),
     "tolerant": Arm(
         "(e) with steps of rays and lenses as built", "spots", steps="rays", as_built=True
     ),
