@@ -183,7 +183,7 @@ def fit(
     step: Callable,
     state: Any,
     scenes: Iterator[np.ndarray],
-    noise: float,
+    noise: Numbers,
     steps: range,
     every: int,
     report: Callable[[int, dict[str, np.ndarray], Any], None],
@@ -193,14 +193,14 @@ def fit(
 
     step, state: as `make_step` and its `init` return them.
     scenes: batches uint8 (B, P, P, C), one for each step.
-    noise: standard deviation, for values from 0 to 1.
+    noise: standard deviation, for values from 0 to 1; for a `FieldImager` also read and shot noise.
     steps: indices of the steps.
     every: number of steps between reports; between them nothing waits for the device.
     report: report(start, metrics, state), called every `every` steps and at the end, with the
         metrics since step `start` stacked on the first axis.
     stopped: called after each step; True ends the loop early, with a report.
     """
-    strength = np.float32(noise)
+    strength = np.asarray(noise, np.float32)
     pending: list[dict[str, Array]] = []
     for index in steps:
         state, metric = step(state, next(scenes), strength, np.int32(index))
@@ -220,7 +220,7 @@ def evaluate(
     parameters: dict[str, Any],
     patches: np.ndarray,
     distance: float,
-    noise: float,
+    noise: Numbers,
     seed: int,
     batch: int = 32,
 ) -> dict[str, float]:
@@ -233,7 +233,7 @@ def evaluate(
     parameters: of optics and network.
     patches: uint8 (N, P, P, C).
     distance: of the object, mm.
-    noise: standard deviation of the noise.
+    noise: as of `fit`.
     seed: seed of the noise.
     batch: number of patches that are imaged at a time.
     """
@@ -242,7 +242,7 @@ def evaluate(
         part = np.asarray(patches[start : start + batch])
         filled = np.concatenate([part, np.zeros((batch - len(part), *part.shape[1:]), np.uint8)])
         key = jax.random.fold_in(jax.random.key(seed), start)
-        images = imager(parameters, filled, distance, np.float32(noise), key)[:3]
+        images = imager(parameters, filled, distance, np.asarray(noise, np.float32), key)[:3]
         for truth, sensor, image in zip(*(np.asarray(a)[: len(part)] for a in images)):
             rows.append(_quality(truth, image, "") | _quality(truth, sensor, "sensor_"))
     means = {name: float(np.mean([row[name] for row in rows])) for name in rows[0]}
