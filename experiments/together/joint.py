@@ -186,8 +186,9 @@ def tables(results: dict[str, Any]) -> dict[str, str]:
         speed = f"{1e3 * float(np.median([row['step_s'] for row in own])):.3g}"
         rows.append([ARMS[arm].title, len(own), *cells, spot, speed])
     found = {f"joint, {name}": _common.table(header, rows)}
-    if any(results["filter_db"].values()):
-        lines = [[key, f"{db:.2f}"] for key, db in results["filter_db"].items()]
+    behind = results.get("filter_db", {})  # older runs have none
+    if any(behind.values()):
+        lines = [[key, f"{db:.2f}"] for key, db in behind.items()]
         header = ["lens", "PSNR dB behind its best filter, closed form"]
         found[f"joint, {name}: before training"] = _common.table(header, lines)
     if results["builds"]:
