@@ -47,9 +47,9 @@ ALLOWED_ALL = {"learn.__init__", "show.layout", "show.analyses", "show.sheet", "
 ROOMS = {
     "drt_jax": 554,
     "drt_jax/check": 298,
-    "drt_jax/design": 2474,
+    "drt_jax/design": 2467,
     "drt_jax/files": 2928,
-    "drt_jax/image": 3040,
+    "drt_jax/image": 3041,
     "drt_jax/learn": 656,
     "drt_jax/lens": 1478,
     "drt_jax/pupil": 776,

@@ -32,8 +32,6 @@ from .field_rays import EXTRAS, FieldRays
 
 # Cells of the pupil along a side: for transfer functions and Strehl ratios, for encircled energy.
 _CELLS, _ENERGY = 64, 128
-# Mean of photographs, for the shot noise of `filter_error`.
-_MEAN = 0.4
 
 
 def degree_of(rule: PupilRule) -> int:
@@ -124,32 +122,28 @@ def psf(
 
 
 def filter_error(
-    power: Numbers,
-    noise: Numbers,
-    light: Numbers,
-    pixel: Numbers,
-    size: int = 21,
-    kind: Kind = "waves",
-    cells: int = _CELLS,
+    kernels: Callable[[Lens, FieldRays], Psf], light: Numbers, noise: Numbers, power: Numbers
 ) -> Callable[[Lens, FieldRays], Array]:
     """An operand of your own: the error of the best linear filter behind the lens, for all fields,
     distances and wavelengths of a problem together, see `image.wiener`.
 
-    Its merit is the mean square error of the restored image, summed over the channels (one a
-    wavelength): a lens is designed for what comes out of the computer, without images or training.
-    Begin with a lens that spots have finished, and with `Operand` around it for a weight.
+    Its merit is the mean square error of the filtered images, summed over the channels, one for
+    each wavelength. It needs neither images nor training. Begin with a lens that spots have
+    finished.
 
-    power: (N, N // 2 + 1, W, W), see `learn.power_of`; N of `size` at least.
+    kernels: what the camera sees of the points, by `psf`: `lambda lens, rays: psf(lens, rays,
+        pixel)`.
+    light: (W,) or (), solid angle of the light for which the noise is given, see `drt_jax.psf`. The
+        noise of points with less light is amplified.
     noise: see `learn.noise_of`.
-    light: (W,) or (), solid angle of the light for which the noise is said, see `drt_jax.psf`: less
-        of it is amplified. Shot noise is that of the value 0.4.
-    pixel, size, kind, cells: as in `psf`.
+    power: (N, N // 2 + 1, W, W), spectrum of the scenes, see `learn.power_of`; N at least as large
+        as the kernels.
     """
 
     def residuals(lens: Lens, rays: FieldRays) -> Array:
-        seen = psf(lens, rays, pixel, size, kind, cells)
+        seen = kernels(lens, rays)
         full = jnp.broadcast_to(jnp.asarray(light), seen.solid_angle.shape)
-        grain = noise_of(noise, seen.solid_angle / full, _MEAN)
+        grain = noise_of(noise, seen.solid_angle / full)
         return safe_sqrt(wiener(seen.kernel, grain, power, 1).error).ravel()
 
     return residuals

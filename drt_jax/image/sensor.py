@@ -11,7 +11,8 @@ from .kernel import SeparableKernel
 
 Convolve = Callable[[Array, SeparableKernel | Array], Array]
 # Smallest amount of light for which the gain of the sensor compensates; below it the image is dark.
-_DARKEST = 0.02
+# Mean of photographs.
+_DARKEST, _MEAN = 0.02, 0.4
 
 
 def _banded(kernel: Array, outputs: int) -> Array:
@@ -151,13 +152,14 @@ def sensor_layer(
     return images + jnp.asarray(noise, images.dtype) * white
 
 
-def noise_of(noise: Numbers, light: Array, value: Numbers) -> Array:
+def noise_of(noise: Numbers, light: Array, value: Numbers = _MEAN) -> Array:
     """Standard deviation of the noise of an image whose gain makes up for the light that is lost.
 
     noise: standard deviation of the read noise, (); or of read and shot noise, (2,), that of the
         shot noise at the value 1, both where the light is 1.
     light: on the sensor, relative; below 0.02 the gain stays.
-    value: of the image without noise, from 0 to 1, shape as `light`, or what broadcasts to it.
+    value: of the image without noise, from 0 to 1, of a shape that broadcasts with `light`; by
+        default the mean of photographs.
     """
     gain = 1 / jnp.maximum(light, _DARKEST)
     read, *shot = jnp.atleast_1d(jnp.asarray(noise, gain.dtype))

@@ -53,16 +53,19 @@ def power_of(patches: np.ndarray, side: int = 64) -> np.ndarray:
 def wiener(kernels: Array, noise: Numbers, power: Numbers, size: int = 33) -> Wiener:
     """The best linear filter of a camera. Differentiable.
 
-    kernels: (P, C, K, K), of P object points that count alike, about the same centre for all
+    kernels: (P, C, K, K), of P object points that count alike, with K odd and one centre for all
         channels, as of `psf`.
     noise: standard deviation of the noise, (P, C), or what broadcasts to it, see `noise_of`.
     power: (N, N // 2 + 1, C, C), see `power_of`, with N of K and of `size` at least.
     size: number of taps T along a side, odd.
+
+    ValueError for sizes that are even, and for a spectrum of too few frequencies.
     """
     power, noise = (jnp.asarray(a, kernels.dtype) for a in (power, noise))
     count, side = power.shape[0], kernels.shape[-1]
-    fits = count >= max(side, size) and size % 2 == 1
-    require(fits, f"power: {count} frequencies, kernels of {side}, {size} taps: too few, or even")
+    sizes = f"kernels of {side} pixels and {size} taps"
+    require(size % 2 == side % 2 == 1, f"{sizes}: give odd numbers")
+    require(count >= max(side, size), f"power: {count} frequencies a side are too few for {sizes}")
     padded = jnp.pad(kernels, ((0, 0), (0, 0), *((0, count - side),) * 2))
     response = jnp.fft.rfft2(jnp.roll(padded, (-(side // 2),) * 2, (2, 3)))
     response = jnp.moveaxis(response, 1, -1)  # (P, N, N // 2 + 1, C)

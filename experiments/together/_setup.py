@@ -27,14 +27,15 @@ from .runs.config import ConfigError
 # Fields of least squares: rings of equal area, and the edge with a small weight, so that limits
 # hold there; depths, and the order of the pupil rule.
 _RINGS, _EDGE, _DEPTHS, _ORDER = 4, 0.05, 5, 6
-# Side of the spectra behind filters, pixels; most Jacobians of least squares on their error.
+# Largest side of the spectra behind filters, pixels; most Jacobians of least squares on their
+# error.
 _SIDE, _JACOBIANS = 64, 60
 # Light outside of a kernel that the spoilt lens may have.
 _LOST = 0.2
 # Lenses as built that training draws from, and their seed; the judge takes another.
 _BUILDS, SEED = 4096, 1
-# Mean of photographs; golden angle, radians.
-_MEAN, _TURN = 0.4, math.pi * (3 - math.sqrt(5))
+# Golden angle, radians.
+_TURN = math.pi * (3 - math.sqrt(5))
 
 
 class Arm(NamedTuple):
@@ -104,12 +105,11 @@ class Setup:
         self._steps: dict[tuple, tuple[Callable, Callable]] = {}
         self._finished: dict[str, Array] = {}
         lens = design.open_apertures(drt_jax.load_lens(config.lens))
-        try:
-            lens = (
-                drt_jax.with_model_glass(lens, config.model_glass) if config.model_glass else lens
-            )
-        except ValueError as error:
-            raise ConfigError(f"model_glass: {error}") from error
+        if config.model_glass:
+            try:
+                lens = drt_jax.with_model_glass(lens, config.model_glass)
+            except ValueError as error:
+                raise ConfigError(f"model_glass: {error}") from error
         self.noise = (config.noise, config.shot)[: 1 + bool(config.shot)]
         self.waves = np.array(config.wavelengths_um)
         self.pixels = 1e-3 * config.camera.pixel_um, config.camera.kernel
@@ -138,10 +138,12 @@ class Setup:
         remedy = f"{room} need {least} cells of waves: raise judge.cells or give a smaller kernel"
         _common.require(config.judge.cells >= least, remedy)
         if config.taps:
-            self._power = learn.power_of(patches.train, _SIDE)
-            more = self._power, self.noise, self._axis, *self.pixels, config.camera.kind
-            error = design.Operand(design.filter_error(*more, cells=self.model.cells))
-            self.filtered = self._problem(self.variables, error)
+            side = min(_SIDE, patches.train.shape[1])
+            self._power = learn.power_of(patches.train, side)
+            options = *self.pixels, self.model.kind, self.model.cells
+            kernels = lambda lens, rays: design.psf(lens, rays, *options)  # noqa: E731
+            error = design.filter_error(kernels, self._axis, np.array(self.noise), self._power)
+            self.filtered = self._problem(self.variables, design.Operand(error))
             taps = jnp.zeros((config.taps, config.taps, 3, 3), jnp.float32)
             self._begin, self.restore = learn.filtered((self._begin, self.restore), taps)
         if config.tolerances:
@@ -377,7 +379,7 @@ class Setup:
 
         def taps(optics: Any) -> Array:
             kernels, light = self.points(optics, seen)
-            grain = learn.noise_of(np.array(self.noise), light, _MEAN)
+            grain = learn.noise_of(np.array(self.noise), light)
             found = learn.wiener(kernels, grain, self._power, self.config.taps)
             return found.taps.astype(jnp.float32)
 

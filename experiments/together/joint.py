@@ -115,7 +115,7 @@ class Config:
         "index" and "abbe" can vary.
     held: kinds of variables that least squares on spots and MTF leave as they are.
     stops: diameters of the entrance pupil that `stopped` tries, relative to that of the solve
-        `entrance_pupil`; joint arms choose theirs between the smallest and the largest.
+        `entrance_pupil`; `filter` and joint arms choose their own, within `limits`.
     depth_m: nearest and farthest object, .inf for infinity.
     noise, shot: standard deviation of the read noise, and of the shot noise of white, where the
         light is that of the whole stop on the axis.
@@ -165,6 +165,12 @@ class Config:
             _common.require(taps, f"arms: {arm} needs taps above 0")
             tries = ARMS[arm].begins not in ("stopped", "freed") or self.stops
             _common.require(tries, f"arms: {arm} needs stops")
+        kinds = sorted({vary.kind for vary in self.variables})
+        _common.require_known("held", self.held, kinds)
+        fits = not self.taps or self.camera.kernel < 64
+        _common.require(fits, "camera.kernel: expected at most 63 pixels where there are taps")
+        solved = not self.stops or "entrance_pupil" in {solve.kind for solve in self.solves}
+        _common.require(solved, "stops: needs the solve entrance_pupil")
         _common.require(self.taps % 2 or not self.taps, "taps: expected an odd number, or 0")
         builds = "tolerant" in self.arms or self.judge.builds
         missing = "tolerances: needs at least one item for lenses as built"

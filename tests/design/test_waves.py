@@ -138,7 +138,8 @@ def test_the_error_behind_the_filter_is_that_of_kernels_of_psf():
     axis = drt_jax.psf(COOKE, Scene.point(wavelengths=COLOURS), pixel, size, sampling=waves)
     line = np.minimum(np.fft.fftfreq(32)[:, None] ** 2 + np.fft.rfftfreq(32)[None] ** 2, 1.0)
     power = (1e-3 / (line + 1e-3))[..., None, None] * (0.2 + 0.8 * np.eye(len(COLOURS)))
-    error = design.filter_error(power, 0.02, axis.solid_angle, pixel, size)
+    kernels = lambda lens, rays: design.psf(lens, rays, pixel, size, cells=64)  # noqa: E731
+    error = design.filter_error(kernels, axis.solid_angle, 0.02, power)
     problem = Problem.from_variables(variables, [design.Operand(error)], scene, 6)
     both = jit(jax.value_and_grad(problem.merit), LARGE)
     x = variables.start

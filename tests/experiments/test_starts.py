@@ -237,6 +237,8 @@ def test_a_filter_in_front_of_the_network_and_the_best_stop(tmp_path):
         ("arms=[filter]", "arms: filter needs taps above 0"),
         ("arms=[freed]", "arms: freed needs"),
         ("model_glass=[0]", "model_glass: surfaces: no glass begins behind surface 0"),
+        ("held=[abbe]", "held: unknown 'abbe'; known: curvature, sensor"),
+        ("stops=[1]", "stops: needs the solve entrance_pupil"),
         ("taps=4", "taps: expected an odd number, or 0"),
         ("variables=[{kind: conic, surfaces: [9]}]", "variables: conic: no surface 9"),
         ("judge.builds=5", "tolerances: needs at least one item"),

@@ -81,8 +81,10 @@ def test_without_blur_or_noise_the_filter_changes_nothing():
     np.testing.assert_allclose(found.taps[3, 3], np.eye(3), atol=1e-9)
     assert np.sum(found.error) < 1e-12
     assert np.sum(abs(np.asarray(found.taps))) == pytest.approx(3, abs=1e-6)
-    with pytest.raises(ValueError, match="power: 16 frequencies, kernels of 5, 17 taps"):
+    with pytest.raises(ValueError, match="power: 16 frequencies a side are too few for"):
         wiener(point, 0.0, power, 17)
+    with pytest.raises(ValueError, match="kernels of 5 pixels and 6 taps: give odd numbers"):
+        wiener(point, 0.0, power, 6)
 
 
 def test_the_mean_of_the_power_is_the_mean_square():
