@@ -61,7 +61,7 @@ ROOMS = {
     "experiments/paper": 608,
     "experiments/runs": 453,
     "experiments/speed": 1432,
-    "experiments/together": 517,
+    "experiments/together": 522,
     "experiments/trust": 1992,
 }
 PUBLIC = 60

@@ -128,8 +128,8 @@ def filter_error(
     distances and wavelengths of a problem together, see `image.wiener`.
 
     Its merit is the mean square error of the filtered images, summed over the channels, one for
-    each wavelength. It needs neither images nor training. Begin with a lens that spots have
-    finished.
+    each wavelength; rays that fail add to it as with every operand. It needs neither images nor
+    training. Begin with a lens that spots have finished.
 
     kernels: what the camera sees of the points, by `psf`: `lambda lens, rays: psf(lens, rays,
         pixel)`.

@@ -62,7 +62,6 @@ class Arm(NamedTuple):
 
 ARMS = {
     "focus": Arm("(a) focus and network", "spoilt", "sensor"),
-    "given": Arm("(a) lens as it is, then network", "given", "nothing"),
     "spots": Arm("(b) least squares on spots, then network", "spots", "nothing"),
     "longer": Arm("(b) with twice the steps", "spots", "nothing", longer=2),
     "stopped": Arm("(b) with its best stop", "stopped", "nothing"),
@@ -77,7 +76,6 @@ ARMS = {
     "frozen": Arm("(f) lens of (b) through its frozen network", "spots", frozen=True),
     "filter": Arm("(g) least squares on the filter's error, then network", "filter", "nothing"),
     "rays_from_filter": Arm("(h) jointly from (g), steps of rays", "filter", steps="rays"),
-    "rays_from_given": Arm("(h) jointly from (a), steps of rays", "given", steps="rays"),
     "built_network": Arm("(b) with lenses as built", "spots", "nothing", as_built=True),
     "tolerant": Arm(
         "(e) with steps of rays and lenses as built", "spots", steps="rays", as_built=True
@@ -103,7 +101,6 @@ class Setup:
     def __init__(self, config: Any, patches: Patches) -> None:
         self.config, self.patches = config, patches
         self._steps: dict[tuple, tuple[Callable, Callable]] = {}
-        self._finished: dict[str, Array] = {}
         lens = design.open_apertures(drt_jax.load_lens(config.lens))
         if config.model_glass:
             try:
@@ -125,6 +122,7 @@ class Setup:
         errors = spoil.per_cent, spoil.off_mm, spoil.seed
         vector = design.as_built_starts(self.variables, 1, *errors)[0]
         self.spoilt = jnp.clip(vector, self.variables.low, self.variables.high)
+        self._finished = {"spoilt": self.spoilt}
         self._begin, self.restore = learn.red_net(**dataclasses.asdict(config.network))
         self.mesh = mesh_of(config.devices)
         self.model = self._model()
@@ -185,12 +183,10 @@ class Setup:
         return design.Problem.from_variables(variables, both, scene, order)
 
     def finished(self, name: str, once: Callable[[str, Callable[[], list]], list]) -> Array:
-        """The vector of a lens at the start of an arm: "given", "spoilt", or what least squares
-        make of it: on "spots", on "mtf", on spots with the best stop ("stopped", the one with the
-        least error of the filter) and with all variables ("freed"), and on the error of the
-        "filter". once: keeps a result, see `Run.once`."""
-        if name in ("given", "spoilt"):
-            return self.spoilt if name == "spoilt" else self.variables.start
+        """The vector of a lens at the start of an arm: "spoilt", or what least squares make of it:
+        on "spots", on "mtf", on spots with the best stop ("stopped": the one with the least error
+        of the filter), the same with all variables ("freed"), and on the error of the "filter".
+        once: keeps a result, see `Run.once`."""
         if name not in self._finished:
             best = "freed" if self.config.stops else "spots"
             before = self.finished(_BEFORE.get(name, best), once)

@@ -9,9 +9,9 @@ both by Adam; `cosine_from_spots` with rates that fall; `rays` and `rays_from_sp
 lenses as built, `built_network` is `spots` with them. With `taps`, the network begins with the best
 linear filter of its lens: `stopped` is `spots` with the best of `stops`, `freed` also moves what
 `held` keeps; `filter` finishes the lens on the error of that filter, and `rays_from_filter` goes on
-jointly. `given` and `rays_from_given` begin with the lens as it is. Every arm has the same data,
-steps and starts of the network. Another model of the picture judges them: waves, more fields, more
-wavelengths, images that no arm has seen. Writes lenses/ARM SEED.yaml.
+jointly. Every arm has the same data, steps and starts of the network. Another model of the picture
+judges them: waves, more fields, more wavelengths, images that no arm has seen. Writes lenses/ARM
+SEED.yaml.
 """
 
 import dataclasses
@@ -159,12 +159,14 @@ class Config:
     def __post_init__(self) -> None:
         _sharing.require_shared(self.devices, "train.batch", self.train.batch)
         for arm in self.arms:
-            both = not ARMS[arm].frozen or "spots" in self.arms
-            _common.require(both, f"arms: {arm} needs spots")
-            taps = ARMS[arm].begins not in ("stopped", "freed", "filter") or self.taps
-            _common.require(taps, f"arms: {arm} needs taps above 0")
-            tries = ARMS[arm].begins not in ("stopped", "freed") or self.stops
-            _common.require(tries, f"arms: {arm} needs stops")
+            begins, lacks = ARMS[arm].begins, []
+            if ARMS[arm].frozen and "spots" not in self.arms:
+                lacks.append("spots")
+            if begins in ("stopped", "freed", "filter") and not self.taps:
+                lacks.append("taps above 0")
+            if begins in ("stopped", "freed") and not self.stops:
+                lacks.append("stops")
+            _common.require(not lacks, f"arms: {arm} needs {' and '.join(lacks)}")
         kinds = sorted({vary.kind for vary in self.variables})
         _common.require_known("held", self.held, kinds)
         fits = not self.taps or self.camera.kernel < 64
@@ -172,7 +174,7 @@ class Config:
         solved = not self.stops or "entrance_pupil" in {solve.kind for solve in self.solves}
         _common.require(solved, "stops: needs the solve entrance_pupil")
         _common.require(self.taps % 2 or not self.taps, "taps: expected an odd number, or 0")
-        builds = "tolerant" in self.arms or self.judge.builds
+        builds = self.judge.builds or any(ARMS[arm].as_built for arm in self.arms)
         missing = "tolerances: needs at least one item for lenses as built"
         _common.require(bool(self.tolerances) or not builds, missing)
 
