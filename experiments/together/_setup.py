@@ -32,8 +32,10 @@ _RINGS, _EDGE, _DEPTHS, _ORDER = 4, 0.05, 5, 6
 _SIDE, _JACOBIANS = 64, 60
 # Light outside of a kernel that the spoilt lens may have.
 _LOST = 0.2
-# Lenses as built that training draws from, and their seed; the judge takes another.
+# Lenses as built that training draws from, and their seed; the judge takes the next one. Lenses as
+# built of least squares, with a seed of their own, and the order of their pupil rule.
 _BUILDS, SEED = 4096, 1
+_FEW, _COARSE = 48, 4
 # Golden angle, radians.
 _TURN = math.pi * (3 - math.sqrt(5))
 
@@ -77,12 +79,21 @@ ARMS = {
     "filter": Arm("(g) least squares on the filter's error, then network", "filter", "nothing"),
     "rays_from_filter": Arm("(h) jointly from (g), steps of rays", "filter", steps="rays"),
     "built_network": Arm("(b) with lenses as built", "spots", "nothing", as_built=True),
+    "built_spots": Arm(
+        "(i) least squares on spots of lenses as built, then network", "built", "nothing",
+        as_built=True
+    ),
     "tolerant": Arm(
         "(e) with steps of rays and lenses as built", "spots", steps="rays", as_built=True
     ),
-}
+    "tolerant_from_built": Arm(
+        "(j) jointly from (i), steps of rays and lenses as built", "built", steps="rays",
+        as_built=True
+    ),
+}  # fmt: skip
 # Of each finished lens the one that it begins with.
-_BEFORE = {"spots": "spoilt", "mtf": "spots", "stopped": "spots", "freed": "stopped"}
+_BEFORE = {"spots": "spoilt", "mtf": "spots", "built": "spots", "stopped": "spots"}
+_BEFORE |= {"freed": "stopped"}
 
 
 class Setup:
@@ -184,8 +195,9 @@ class Setup:
 
     def finished(self, name: str, once: Callable[[str, Callable[[], list]], list]) -> Array:
         """The vector of a lens at the start of an arm: "spoilt", or what least squares make of it:
-        on "spots", on "mtf", on spots with the best stop ("stopped": the one with the least error
-        of the filter), the same with all variables ("freed"), and on the error of the "filter".
+        on "spots", on "mtf", on spots of lenses as "built", on spots with the best stop ("stopped":
+        the one with the least error of the filter), the same with all variables ("freed"), and on
+        the error of the "filter".
         once: keeps a result, see `Run.once`."""
         if name not in self._finished:
             best = "freed" if self.config.stops else "spots"
@@ -209,9 +221,12 @@ class Setup:
 
         if name == "filter":
             return best(self.filtered, _JACOBIANS)
-        if name in ("spots", "mtf"):
-            sharp = design.Operand("mtf", target=1.0, at=self.config.mtf_at)
-            aim = {"spots": "spot", "mtf": sharp}[name]
+        if name in ("spots", "mtf", "built"):
+            aim: Any = "spot"
+            if name == "mtf":
+                aim = design.Operand("mtf", target=1.0, at=self.config.mtf_at)
+            if name == "built":
+                aim = design.Operand(self._spots_as_built())
             return best(self._problem(self._variables(lens, held), aim))
         stops = {s: self._variables(lens, held, s) for s in self.config.stops}
         found = [best(self._problem(own, "spot")) for own in stops.values()]
@@ -219,6 +234,23 @@ class Setup:
         for stop, db in zip(stops, reached):
             print(f"stop {stop:g}: {db:.2f} dB behind the filter")
         return found[int(np.argmax(reached))]
+
+    def _spots_as_built(self) -> Callable[[Lens, Any], Array]:
+        """An operand: the spots of `_FEW` lenses as built."""
+        table = jnp.asarray(design.draw_perturbations(self.built, _FEW, SEED + 2))
+        whole = self._problem(self._whole, "spot", order=_COARSE)
+        spot = design.OPERANDS["spot"].function
+
+        def spots_as_built(lens: Lens, rays: Any) -> Array:
+            vector = self.variables.vector(lens)
+
+            def one(deviations: Array) -> Array:
+                built = self.lens_of(vector, deviations)
+                return spot(built, design.trace_fields(whole, built))
+
+            return jax.vmap(one)(table) / math.sqrt(_FEW)
+
+        return spots_as_built
 
     @functools.cached_property
     def rates(self) -> Array:

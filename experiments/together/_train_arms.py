@@ -125,12 +125,12 @@ def _pictures(setup: Setup, imager: Callable, parameters: Any) -> dict[str, np.n
 
 
 def _as_built(setup: Setup, run: Run, trained: dict[tuple[str, int], Any]) -> list[dict]:
-    """PSNR of lenses as built, of arms that begin with the finished lens, by rays at the points of
-    the judge."""
+    """PSNR of lenses as built, of arms that begin with a lens whose spots are finished, by rays at
+    the points of the judge."""
     imager = jax.jit(FieldImager(setup.points, setup.restore).__call__)
     rows = []
     for (arm, seed), parameters in trained.items():
-        if ARMS[arm].begins == "spots" and not ARMS[arm].frozen:
+        if ARMS[arm].begins in ("spots", "built") and not ARMS[arm].frozen:
             job = f"built {arm} {seed}"
             own = run.once(job, lambda: _decibels(setup, imager, parameters, job))
             rows.append({"arm": arm, "seed": seed} | own)

@@ -6,12 +6,13 @@ trains all variables and the network from the spoilt lens, `joint_from_spots` fr
 both by Adam; `cosine_from_spots` with rates that fall; `rays` and `rays_from_spots` are `joint` and
 `joint_from_spots` with steps that are measured by rays, `rays_from_mtf` begins with the lens of
 `mtf`; `frozen` trains the lens of `spots` through its network; `tolerant` is `rays_from_spots` with
-lenses as built, `built_network` is `spots` with them. With `taps`, the network begins with the best
-linear filter of its lens: `stopped` is `spots` with the best of `stops`, `freed` also moves what
-`held` keeps; `filter` finishes the lens on the error of that filter, and `rays_from_filter` goes on
-jointly. Every arm has the same data, steps and starts of the network. Another model of the picture
-judges them: waves, more fields, more wavelengths, images that no arm has seen. Writes lenses/ARM
-SEED.yaml.
+lenses as built, `built_network` is `spots` with them; `built_spots` finishes the lens on spots of
+lenses as built, and `tolerant_from_built` goes on jointly. With `taps`, the network begins with the
+best linear filter of its lens: `stopped` is `spots` with the best of `stops`, `freed` also moves
+what `held` keeps; `filter` finishes the lens on the error of that filter, and `rays_from_filter`
+goes on jointly. Every arm has the same data, steps and starts of the network. Another model of the
+picture judges them: waves, more fields, more wavelengths, images that no arm has seen. Writes
+lenses/ARM SEED.yaml.
 """
 
 import dataclasses
