@@ -15,8 +15,8 @@ from tqdm import tqdm
 import drt_jax
 from drt_jax import design
 from drt_jax.learn import train
-from drt_jax.learn.data import batches
-from drt_jax.learn.field import FieldImager
+from drt_jax.learn.data import DataConfig, batches, load_patches
+from drt_jax.learn.field import FieldImager, ObjectPoints
 
 from . import _common, _training
 from ._setup import ARMS, SEED, Setup
@@ -24,8 +24,9 @@ from .runs.folder import Run
 
 # Steps between those of two seeds, which points and noise depend on.
 _APART = 10**7
-# Patches of a picture.
-_SHOWN = 5
+# Patches of a picture; of a photograph through two lenses its side, pixels, and its place in the
+# field.
+_SHOWN, _SIDE, _PLACE = 5, 192, 0.7
 
 
 def run(config: Any, run: Run) -> dict[str, Any]:
@@ -37,6 +38,7 @@ def run(config: Any, run: Run) -> dict[str, Any]:
     (run.folder / "lenses").mkdir(exist_ok=True)
     _save(setup, run, "spoilt", setup.spoilt)
     imager = jax.jit(FieldImager(setup.judged_points, setup.restore).__call__)
+    test = {"": setup.patches.test} | _others(config, side, run)
     rows, losses, trained = [], [], {}
     arms = [arm for arm in ARMS if arm in config.arms]  # `frozen` after `spots`
     jobs = {(arm, seed): f"{arm} {seed}" for arm in arms for seed in range(config.seeds)}
@@ -47,7 +49,7 @@ def run(config: Any, run: Run) -> dict[str, Any]:
         trained[arm, seed], vector = found, found["optics"]["lens"]
         _save(setup, run, job, vector)
         row = {"arm": arm, "seed": seed, "step_s": seconds, "spot_um": setup.spot_um(vector)}
-        judge = partial(_judged, setup, imager, found)
+        judge = partial(_judged, setup, imager, found, test)
         rows.append(run.once(f"judged {job}", lambda: row | judge()))
     for arm in arms:
         own = [run.metrics(jobs[arm, seed])["loss"] for seed in range(config.seeds)]
@@ -58,6 +60,7 @@ def run(config: Any, run: Run) -> dict[str, Any]:
     for arm in arms:
         images = _pictures(setup, imager, trained[arm, 0])
         pictures |= {f"{arm} {name}": array[some] for name, array in images.items()}
+    builds = _as_built(setup, run, trained) if config.judge.builds else []
     return {
         **_common.settings(config, "name", "field_deg"),
         "rows": rows,
@@ -65,12 +68,13 @@ def run(config: Any, run: Run) -> dict[str, Any]:
         "losses": losses,
         "start_um": {name: setup.spot_um(vector) for name, vector in lenses.items()},
         "filter_db": {name: setup.filter_db(vector) for name, vector in lenses.items()},
-        "builds": _as_built(setup, run, trained) if config.judge.builds else [],
+        "builds": builds,
         "drawn": ["spoilt", *(jobs[arm, 0] for arm in arms)],
         "pictures": arms,
         "pictures_deg": angles[some].tolist(),
         "far_mm": setup.depths[1] if math.isfinite(setup.depths[1]) else None,
         **pictures,
+        **_photograph(setup, side, trained, builds or rows),
     }
 
 
@@ -105,11 +109,29 @@ def _save(setup: Setup, run: Run, name: str, vector: Array) -> None:
     drt_jax.save_lens(lens, run.folder / "lenses" / f"{name}.yaml")
 
 
-def _judged(setup: Setup, imager: Callable, parameters: Any) -> dict[str, float]:
-    """Quality of the images of an arm, by the judge."""
-    config, count = setup.config, len(setup.judged.fields)
-    patches = _training.thinned(setup.patches.test, config.judge.patches * count)
-    return train.evaluate(imager, parameters, patches, setup.judged, setup.noise, 0, count)
+def _others(config: Any, side: int, run: Run) -> dict[str, np.ndarray]:
+    """Patches of `judge.others`, of each image one: all, and the thirds with the least and the most
+    colour; {} without."""
+    if not config.judge.others:
+        return {}
+    data = DataConfig(config.judge.others, 1, 0.99)
+    every = _training.read_patches(data, side, 0, run.folder).test
+    colour = np.argsort(np.mean(np.ptp(every, axis=-1), axis=(1, 2)))
+    third = len(every) // 3
+    return {"others": every, "grey": every[colour[:third]], "coloured": every[colour[-third:]]}
+
+
+def _judged(
+    setup: Setup, imager: Callable, parameters: Any, test: dict[str, np.ndarray]
+) -> dict[str, Any]:
+    """Quality of the images of an arm, by the judge; of other images than the first PSNR alone."""
+    count, found = len(setup.judged.fields), {}
+    for name, every in test.items():
+        patches = _training.thinned(every, setup.config.judge.patches * count)
+        given = patches, setup.judged, setup.noise, 0, count
+        own = train.evaluate(imager, parameters, *given)
+        found |= {f"{name}_psnr": own["psnr"]} if name else own
+    return found
 
 
 def _one_each(setup: Setup, patches: np.ndarray) -> np.ndarray:
@@ -122,6 +144,39 @@ def _pictures(setup: Setup, imager: Callable, parameters: Any) -> dict[str, np.n
     some = _training.textured(setup.patches.test, len(setup.judged.fields))
     given = _one_each(setup, some), setup.judged, setup.noise, 0
     return _training.images(imager, parameters, *given)
+
+
+def _photograph(
+    setup: Setup, side: int, trained: dict[tuple[str, int], Any], rows: list[dict]
+) -> dict[str, Any]:
+    """A test photograph through two lenses, that of the first arm and the best, and through their
+    networks. Lenses as built have the errors of that one which ends the worst tenth of the first
+    arm.
+
+    rows: of lenses as built, or of arms.
+    """
+    config, measure = setup.config, "low" if "low" in rows[0] else "psnr"
+    groups = _common.grouped(rows, "arm").items()
+    means = {arm: float(np.mean([row[measure] for row in own])) for (arm,), own in groups}
+    arms = list(dict.fromkeys([next(iter(means)), max(means, key=means.__getitem__)]))
+    errors = None
+    if measure == "low":
+        table, each = _built_lenses(setup), rows[0]["each"]
+        errors = jnp.asarray(table[np.argsort(each)[len(each) // 10]])
+    every = load_patches(config.data, side - config.train.patch + _SIDE, 0).test
+    scene = every[[int(np.argmax(np.std(every, axis=(1, 2, 3))))]]
+    field = jnp.array([[0.0, math.atan(_PLACE * math.tan(setup.field))]])
+    seen = ObjectPoints(field, jnp.array([setup.depths[1]]), errors)
+    imager, found = jax.jit(FieldImager(setup.points, setup.restore).__call__), {}
+    for arm in arms:
+        images = _training.images(imager, trained[arm, 0], scene, seen, setup.noise, 0)
+        found |= {f"photograph {arm} {name}": image[0] for name, image in images.items()}
+    return {"photographs": arms, "measure": [means[arm] for arm in arms], **found}
+
+
+def _built_lenses(setup: Setup) -> np.ndarray:
+    """Deviations of the lenses as built of the judge."""
+    return design.draw_perturbations(setup.built, setup.config.judge.builds, SEED + 1)
 
 
 def _as_built(setup: Setup, run: Run, trained: dict[tuple[str, int], Any]) -> list[dict]:
@@ -137,9 +192,9 @@ def _as_built(setup: Setup, run: Run, trained: dict[tuple[str, int], Any]) -> li
     return rows
 
 
-def _decibels(setup: Setup, imager: Callable, parameters: Any, job: str) -> dict[str, float]:
-    """PSNR of the lens as designed, and of lenses as built the mean and the 10th percentile."""
-    table = design.draw_perturbations(setup.built, setup.config.judge.builds, SEED + 1)
+def _decibels(setup: Setup, imager: Callable, parameters: Any, job: str) -> dict[str, Any]:
+    """PSNR of the lens as designed; of lenses as built each, the mean, and the 10th percentile."""
+    table = _built_lenses(setup)
     patches = _training.thinned(setup.patches.test, len(setup.judged.fields))
     patches, found = _one_each(setup, patches), []
     noise, key = np.float32(setup.noise), jax.random.key(0)
@@ -148,5 +203,6 @@ def _decibels(setup: Setup, imager: Callable, parameters: Any, job: str) -> dict
         truth, _, image = imager(parameters, patches, view, noise, key)
         squares = np.mean(np.square(np.asarray(image - truth)), axis=(1, 2, 3))
         found.append(float(np.mean(-10 * np.log10(squares))))
-    built = {"mean": float(np.mean(found[1:])), "low": float(np.percentile(found[1:], 10))}
-    return {"designed": found[0]} | built
+    each = np.round(found[1:], 3)
+    built = {"mean": float(np.mean(each)), "low": float(np.percentile(each, 10))}
+    return {"designed": found[0]} | built | {"each": each.tolist()}

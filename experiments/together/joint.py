@@ -19,6 +19,7 @@ import dataclasses
 import math
 import pathlib
 import sys
+import textwrap
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -93,6 +94,8 @@ class Judge:
     rings: fields, each at another azimuth. depths: distances, even in 1 / distance.
     waves: wavelengths of each channel. cells: of the wave kernels, along a side.
     patches: for each point. builds: lenses as built, for arms of `tolerances`.
+    others: a folder of photographs that judge, too: all, and the thirds with the least and the most
+        colour; empty for none.
     """
 
     rings: Annotated[int, within(1, 64)] = 8
@@ -102,6 +105,7 @@ class Judge:
     cells: Annotated[int, within(16, 1024)] = 128
     patches: Annotated[int, within(1, 1000)] = 4
     builds: Annotated[int, within(0, 1e4)] = 0
+    others: str = ""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -195,6 +199,14 @@ def tables(results: dict[str, Any]) -> dict[str, str]:
         speed = f"{1e3 * float(np.median([row['step_s'] for row in own])):.3g}"
         rows.append([ARMS[arm].title, len(own), *cells, spot, speed])
     found = {f"joint, {name}": _common.table(header, rows)}
+    if "others_psnr" in results["rows"][0]:
+        header = ["arm", "PSNR dB of other photographs", "least coloured third", "most coloured"]
+        names = [f"{name}_psnr" for name in ("others", "grey", "coloured")]
+        lines = [
+            [ARMS[arm].title, *(_spread([row[name] for row in own], 2) for name in names)]
+            for (arm,), own in groups.items()
+        ]
+        found[f"joint, {name}: other photographs"] = _common.table(header, lines)
     behind = results.get("filter_db", {})  # older runs have none
     if any(behind.values()):
         lines = [[key, f"{db:.2f}"] for key, db in behind.items()]
@@ -245,6 +257,33 @@ def draw(results: dict[str, Any], figures: pathlib.Path) -> None:
         _report.draw_patches(parts, degrees, figures / f"patches_{arm}.png")
         errors[arm.replace("_", "\n")] = np.float32(parts["restored"])
     _plots.patch_grid(figures / "errors.png", degrees, truth, {}, errors)
+    if results["builds"]:
+        with _plots.picture(figures / "builds.png", 6.5, 4.5) as (ax,):
+            for (arm,), own in _common.grouped(results["builds"], "arm").items():
+                values = np.sort(np.ravel([row["each"] for row in own]))
+                ax.plot(values, np.linspace(100, 0, len(values)), label=titles[arm])
+            _plots.label_axes(ax, "PSNR as built, at least (dB)", "lenses (%)")
+    _draw_photographs(results, scene, figures)
+
+
+def _draw_photographs(results: dict[str, Any], scene: Scene, figures: pathlib.Path) -> None:
+    """Draws a photograph through two lenses, a row each: lens, scene, sensor image, restored."""
+    arms = results["photographs"]
+    what = ", worst tenth as built" if results["builds"] else ""
+    with _plots.picture(figures / "photograph.png", 3.2, 3.2, 4 * len(arms), 4) as axes:
+        for row, arm, mean in zip(axes.reshape(-1, 4), arms, results["measure"]):
+            lens = load_lens(figures.parent / "lenses" / f"{arm} 0.yaml")
+            show.lens_drawing(row[0], show.draw(lens, scene)).get_legend().remove()
+            row[0].set_title(textwrap.fill(ARMS[arm].title, 40), fontsize=9)
+            truth, *others = (np.float32(results[f"photograph {arm} {i}"]) for i in _report.IMAGES)
+            titles = ["scene"]
+            for name, image in zip(_report.IMAGES[1:], others):
+                titles.append(f"{name}, {-10 * np.log10(np.mean((image - truth) ** 2)):.1f} dB")
+            titles[-1] += f"\n({mean:.1f} dB{what})"
+            for ax, image, title in zip(row[1:], (truth, *others), titles):
+                ax.imshow(np.clip(image, 0, 1))
+                ax.set_title(title, fontsize=9)
+                ax.set(xticks=[], yticks=[])
 
 
 def _smooth(loss: list[float | None]) -> tuple[np.ndarray, np.ndarray]:
