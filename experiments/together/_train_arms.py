@@ -1,5 +1,7 @@
 """The arms of a joint design: least squares, training, and what another model says of them."""
 
+import dataclasses
+import itertools
 import math
 import time
 from collections.abc import Callable
@@ -33,6 +35,9 @@ def run(config: Any, run: Run) -> dict[str, Any]:
     """Finishes the lenses, trains and judges all arms."""
     side = config.train.patch + config.camera.kernel - 1 + max(config.taps - 1, 0)
     setup = Setup(config, _training.read_patches(config.data, side, 0, run.folder))
+    about = _common.settings(config, "name", "field_deg") | {"map": _map(setup, run)}
+    if not config.arms:
+        return about | {"rows": []}
     begins = {"spoilt": None} | {ARMS[arm].begins: None for arm in ARMS if arm in config.arms}
     lenses = {name: setup.finished(name, run.once) for name in begins}
     (run.folder / "lenses").mkdir(exist_ok=True)
@@ -62,7 +67,7 @@ def run(config: Any, run: Run) -> dict[str, Any]:
         pictures |= {f"{arm} {name}": array[some] for name, array in images.items()}
     builds = _as_built(setup, run, trained) if config.judge.builds else []
     return {
-        **_common.settings(config, "name", "field_deg"),
+        **about,
         "rows": rows,
         "arms": arms,
         "losses": losses,
@@ -76,6 +81,29 @@ def run(config: Any, run: Run) -> dict[str, Any]:
         **pictures,
         **_photograph(setup, side, trained, builds or rows),
     }
+
+
+def _map(setup: Setup, run: Run) -> list[dict[str, Any]]:
+    """PSNR behind the best filter and f-number of finished lenses, for each scene of the map."""
+    rows, asked = [], setup.config.map
+    for near, noise in itertools.product(asked.near_m, asked.noise):
+        scene = dataclasses.replace(
+            setup.config, depth_m=(near, setup.config.depth_m[1]), noise=noise
+        )
+        what = f"{near:g} m, noise {noise:g}"
+        print(f"map: {what}", flush=True)
+
+        def measured() -> dict[str, tuple[float, float]]:
+            own, found = Setup(scene, setup.patches), {}
+            for name in ("spots", "stopped", "freed", "filter"):
+                vector = own.finished(name, lambda part, make: run.once(f"{what}: {part}", make))
+                ideal = drt_jax.first_order(own.lens_of(vector), math.inf, own.waves)
+                found[name] = own.filter_db(vector), float(ideal.f_number[1])
+            return found
+
+        lenses = run.once(f"map {what}", measured)
+        rows.append({"near_m": near, "noise": noise, "lenses": lenses})
+    return rows
 
 
 def _train(

@@ -109,6 +109,15 @@ class Judge:
 
 
 @dataclasses.dataclass(frozen=True)
+class Map:
+    """Scenes of a map of what the lenses in front of the training reach behind their best filter.
+    noise: as of the experiment. near_m: nearest objects."""
+
+    noise: Annotated[tuple[float, ...], within(1e-4, 10), different] = ()
+    near_m: Annotated[tuple[float, ...], within(1e-3, math.inf), different] = ()
+
+
+@dataclasses.dataclass(frozen=True)
 class Config:
     """Settings of the experiment; see configs/joint.yaml.
 
@@ -126,7 +135,8 @@ class Config:
         light is that of the whole stop on the axis.
     taps: side of the filter in front of the network, pixels, odd; 0 for none.
     mtf_at: cycles/mm, of the arm `mtf`.
-    arms: of the experiment's description.
+    arms: of the experiment's description; none if there is a `map`.
+    map: scenes in which no network is trained.
     seeds: starts of the network, with data and noise of their own.
     tolerances: of parts of the lens, for `tolerant` and judge.builds.
     refocus: True if the sensor of a lens as built follows its paraxial focus.
@@ -158,6 +168,7 @@ class Config:
     tolerances: tuple[Tolerance, ...] = ()
     refocus: bool = False
     judge: Judge = Judge()
+    map: Map = Map()
     data: DataConfig = DataConfig()
     devices: int = dataclasses.field(default=1, compare=False)
 
@@ -179,6 +190,10 @@ class Config:
         solved = not self.stops or "entrance_pupil" in {solve.kind for solve in self.solves}
         _common.require(solved, "stops: needs the solve entrance_pupil")
         _common.require(self.taps % 2 or not self.taps, "taps: expected an odd number, or 0")
+        mapped = not (self.map.noise or self.map.near_m) or (self.taps and self.stops)
+        _common.require(bool(mapped), "map: needs taps above 0 and stops")
+        some = self.arms or (self.map.noise and self.map.near_m)
+        _common.require(bool(some), "arms: expected one or more, or a map of noise and near_m")
         builds = self.judge.builds or any(ARMS[arm].as_built for arm in self.arms)
         missing = "tolerances: needs at least one item for lenses as built"
         _common.require(bool(self.tolerances) or not builds, missing)
@@ -186,7 +201,12 @@ class Config:
 
 def tables(results: dict[str, Any]) -> dict[str, str]:
     """Errors of all arms, and their differences from the finished lens."""
-    name, header = results["name"], ["arm", "seeds", "MAE", "RMSE", "PSNR dB", "SSIM"]
+    name, found = results["name"], {}
+    if results.get("map"):
+        found[f"joint, {name}: map"] = _map_table(results["map"])
+    if not results["rows"]:
+        return found
+    header = ["arm", "seeds", "MAE", "RMSE", "PSNR dB", "SSIM"]
     header += ["PSNR dB before the network", "PSNR dB less that of spots", "spot um", "ms a step"]
     rows = []
     groups = _common.grouped(results["rows"], "arm")
@@ -198,7 +218,7 @@ def tables(results: dict[str, Any]) -> dict[str, str]:
         spot = _spread([row["spot_um"] for row in own], 2)
         speed = f"{1e3 * float(np.median([row['step_s'] for row in own])):.3g}"
         rows.append([ARMS[arm].title, len(own), *cells, spot, speed])
-    found = {f"joint, {name}": _common.table(header, rows)}
+    found[f"joint, {name}"] = _common.table(header, rows)
     if "others_psnr" in results["rows"][0]:
         header = ["arm", "PSNR dB of other photographs", "least coloured third", "most coloured"]
         names = [f"{name}_psnr" for name in ("others", "grey", "coloured")]
@@ -222,6 +242,18 @@ def tables(results: dict[str, Any]) -> dict[str, str]:
     return found
 
 
+def _map_table(rows: list[dict[str, Any]]) -> str:
+    """A line for each scene: PSNR and f-number of its lenses."""
+    lines = []
+    for row in rows:
+        cells = [f"{db:.2f} (f/{number:.1f})" for db, number in row["lenses"].values()]
+        best, *others = (row["lenses"][name][0] for name in ("filter", "freed", "stopped"))
+        gains = [f"{best - other:+.2f}" for other in others]
+        lines.append([f"{row['near_m']:g}", f"{row['noise']:g}", *cells, *gains])
+    header = ["nearest, m", "noise", *rows[0]["lenses"], "filter less freed", "less stopped"]
+    return _common.table(header, lines)
+
+
 def _spread(values: list[float], digits: int) -> str:
     """Mean and standard deviation as text."""
     text = f"{np.mean(values):.{digits}f}"
@@ -231,6 +263,17 @@ def _spread(values: list[float], digits: int) -> str:
 def draw(results: dict[str, Any], figures: pathlib.Path) -> None:
     """Draws losses, lenses, and patches through each lens before and after the network."""
     titles = {name: arm.title for name, arm in ARMS.items()}
+    if results.get("map"):
+        groups = _common.grouped(results["map"], "near_m")
+        with _plots.picture(figures / "map.png", 4.5, 4, len(groups), 3) as axes:
+            for ax, ((near,), own) in zip(axes, groups.items()):
+                for name in own[0]["lenses"]:
+                    values = [row["lenses"][name][0] for row in own]
+                    ax.semilogx([row["noise"] for row in own], values, "o-", label=name)
+                ax.set_title(f"{near:g} m to infinity")
+                _plots.label_axes(ax, "noise", "PSNR behind the best filter (dB)")
+    if not results["rows"]:
+        return
     seconds = {row["arm"]: row["step_s"] for row in results["rows"]}  # of the last seed
     lines = {arm: _smooth(loss) for arm, loss in zip(results["arms"], results["losses"])}
     with _plots.picture(figures / "losses.png", 6.5, 4.5, 2) as axes:
@@ -269,17 +312,17 @@ def draw(results: dict[str, Any], figures: pathlib.Path) -> None:
 def _draw_photographs(results: dict[str, Any], scene: Scene, figures: pathlib.Path) -> None:
     """Draws a photograph through two lenses, a row each: lens, scene, sensor image, restored."""
     arms = results["photographs"]
-    what = ", worst tenth as built" if results["builds"] else ""
+    what = "worst tenth as built: " if results["builds"] else ""
     with _plots.picture(figures / "photograph.png", 3.2, 3.2, 4 * len(arms), 4) as axes:
         for row, arm, mean in zip(axes.reshape(-1, 4), arms, results["measure"]):
             lens = load_lens(figures.parent / "lenses" / f"{arm} 0.yaml")
             show.lens_drawing(row[0], show.draw(lens, scene)).get_legend().remove()
-            row[0].set_title(textwrap.fill(ARMS[arm].title, 40), fontsize=9)
+            about = textwrap.fill(ARMS[arm].title, 44)
+            row[0].set_title(f"{about}\n{what}{mean:.1f} dB", fontsize=9)
             truth, *others = (np.float32(results[f"photograph {arm} {i}"]) for i in _report.IMAGES)
             titles = ["scene"]
             for name, image in zip(_report.IMAGES[1:], others):
                 titles.append(f"{name}, {-10 * np.log10(np.mean((image - truth) ** 2)):.1f} dB")
-            titles[-1] += f"\n({mean:.1f} dB{what})"
             for ax, image, title in zip(row[1:], (truth, *others), titles):
                 ax.imshow(np.clip(image, 0, 1))
                 ax.set_title(title, fontsize=9)

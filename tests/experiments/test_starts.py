@@ -9,6 +9,7 @@ import re
 import jax
 import numpy as np
 import pytest
+from PIL import Image
 
 import experiments
 from drt_jax import first_order, load_lens, save_lens
@@ -55,7 +56,7 @@ STARTS = {
         ),
         *("spoil.per_cent=1", "field_deg=2", "camera={pixel_um: 20, kernel: 9, tolerance: 0.2}"),
         *("network={layers: 1, channels: 4}", "seeds=1", "mtf_at=1", "data.crops_per_image=4"),
-        "arms=[focus,spots,joint_from_spots,rays_from_spots,frozen,tolerant]",
+        "arms=[focus,spots,joint_from_spots,rays_from_spots,frozen,built_spots,tolerant]",
         "train={batches: 12, batch: 2, patch: 8, points: 2, checkpoint_every: 5}",
         "tolerances=[{kind: radius, size: 1}, {kind: tilt, size: 3}]",
         "judge={rings: 2, patches: 1, waves: 2, cells: 64, builds: 3}",
@@ -162,14 +163,15 @@ def checked_images(results):
 def checked_joint(results):
     """Every arm trained and judged, and none left the lens that it may not change."""
     rows = {row["arm"]: row for row in results["rows"]}
-    assert list(rows) == results["arms"] and len(rows) == 6
+    assert list(rows) == results["arms"] and len(rows) == 7
     assert all(0 < row["mae"] < 0.6 and row["step_s"] > 0 for row in rows.values()), rows
     assert rows["spots"]["spot_um"] == pytest.approx(results["start_um"]["spots"])
     assert rows["tolerant"]["spot_um"] != rows["spots"]["spot_um"] < results["start_um"]["spoilt"]
-    assert [len(loss) for loss in results["losses"]] == [12] * 6
-    built = ["spots", "joint_from_spots", "rays_from_spots", "tolerant"]
+    assert [len(loss) for loss in results["losses"]] == [12] * 7
+    assert rows["built_spots"]["spot_um"] > rows["spots"]["spot_um"]
+    built = ["spots", "joint_from_spots", "rays_from_spots", "built_spots", "tolerant"]
     assert [row["arm"] for row in results["builds"]] == built
-    assert all(row["low"] <= row["mean"] for row in results["builds"])
+    assert all(row["low"] <= row["mean"] and len(row["each"]) == 3 for row in results["builds"])
 
 
 @pytest.mark.slow
@@ -200,7 +202,12 @@ def test_a_joint_run_that_stops_resumes_to_the_same_numbers(tmp_path, monkeypatc
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:size: ")
 def test_a_filter_in_front_of_the_network_and_the_best_stop(tmp_path):
-    """Least squares on the error of the filter find a better lens for it than those on spots."""
+    """Least squares on the error of the filter find a better lens for it than those on spots.
+    Photographs of a folder judge, too; and one scene of a map has no network."""
+    (photos := tmp_path / "photos").mkdir()
+    for k, colour in enumerate((0, 0, 40, 40, 90, 90)):
+        pixels = np.random.default_rng(k).integers(0, 160, (90, 90, 1)) + [0, colour, 0]
+        Image.fromarray(pixels.astype(np.uint8)).save(photos / f"{k}.png")
     own = [key for key in STARTS["joint"] if not key.startswith(("arms", "tol", "judge", "var"))]
     own += [
         "variables=[{kind: curvature}, {kind: sensor}, {kind: abbe, low: 30, high: 80}]",
@@ -208,15 +215,19 @@ def test_a_filter_in_front_of_the_network_and_the_best_stop(tmp_path):
         "solves=[{kind: entrance_pupil, value: 10}]",
         *("camera.kind=waves", "train.patch=48"),
         "arms=[stopped, freed, filter, rays_from_filter]",
-        "judge={rings: 2, patches: 1, waves: 2, cells: 64}",
+        "judge={rings: 2, patches: 1, waves: 2, cells: 64, others: " + str(photos) + "}",
+        "map={noise: [0.02], near_m: [20]}",
     ]
-    experiment = importlib.import_module("experiments.joint")
-    _command.main(experiment, ["--out", str(tmp_path), "--set", *own])
-    results = json.loads((tmp_path / "results.json").read_text())
+    experiment, out = importlib.import_module("experiments.joint"), tmp_path / "run"
+    _command.main(experiment, ["--out", str(out), "--set", *own])
+    results = json.loads((out / "results.json").read_text())
     behind = results["filter_db"]
     assert behind["filter"] > 1 + max(behind[name] for name in ("stopped", "freed")), behind
     assert len(results["rows"]) == 4 and all(0 < row["mae"] < 0.6 for row in results["rows"])
-    assert len(experiment.tables(results)) == 2
+    (scene,) = results["map"]
+    assert scene["lenses"]["filter"][0] > scene["lenses"]["freed"][0]
+    assert all("grey_psnr" in row for row in results["rows"])
+    assert len(experiment.tables(results)) == 4
 
 
 @pytest.mark.parametrize(
@@ -234,6 +245,8 @@ def test_a_filter_in_front_of_the_network_and_the_best_stop(tmp_path):
         ),
         ("train.batch=3", "train.batch: expected a multiple of train.points"),
         ("arms=[frozen]", "arms: frozen needs spots"),
+        ("arms=[]", "arms: expected one or more, or a map of noise and near_m"),
+        ("map.noise=[0.1]", "map: needs taps above 0 and stops"),
         ("arms=[filter]", "arms: filter needs taps above 0"),
         ("arms=[freed]", "arms: freed needs taps above 0 and stops"),
         ("arms=[built_network]", "tolerances: needs at least one item"),
