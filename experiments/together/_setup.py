@@ -33,7 +33,7 @@ _SIDE, _JACOBIANS = 64, 60
 # Light outside of a kernel that the spoilt lens may have.
 _LOST = 0.2
 # Lenses as built that training draws from, and their seed; the judge takes the next one. Lenses as
-# built of least squares, with a seed of their own, and the order of their pupil rule.
+# built of least squares. Order of the pupil rule of those and of the metric of rays.
 _BUILDS, SEED = 4096, 1
 _FEW, _COARSE = 48, 4
 # Golden angle, radians.
@@ -100,7 +100,7 @@ class Setup:
     """What all arms of a run share.
 
     variables: of the lens, with open apertures.
-    spots: problem of spots, whose rays measure steps.
+    spots: problem of spots.
     limits: problem whose limits hold in training.
     spoilt: (N,), vector of the spoilt lens.
     patches: training and test patches.
@@ -125,10 +125,12 @@ class Setup:
         self.depths = tuple(1e3 * d for d in config.depth_m)
         self.variables = self._variables(lens, free=True)
         self.spots = self._problem(self.variables, "spot")
-        # Edges and thicknesses ask for rays of the rim alone.
+        # Edges and thicknesses ask for rays of the rim alone, and are least in the middle or at the
+        # edge of the field.
         of_rays = any("fields" in design.OPERANDS[o.kind].names for o in config.limits)
-        order = _ORDER if of_rays else 2
-        self.limits = self._problem(self.variables, order=order) if config.limits else self.spots
+        few = {} if of_rays else {"order": 2, "ends": True}
+        self.limits = self._problem(self.variables, **few) if config.limits else self.spots
+        self._metric = self._problem(self.variables, "spot", order=_COARSE)
         spoil = config.spoil
         errors = spoil.per_cent, spoil.off_mm, spoil.seed
         vector = design.as_built_starts(self.variables, 1, *errors)[0]
@@ -182,13 +184,16 @@ class Setup:
         return design.Variables.from_lens(lens, vary, config.ties, solves)
 
     def _problem(
-        self, variables: design.Variables, *operands: Any, order: int = _ORDER
+        self, variables: design.Variables, *operands: Any, order: int = _ORDER, ends: bool = False
     ) -> design.Problem:
+        """A problem of operands and limits over field and depth. ends: True for the middle and the
+        edge of the field alone."""
         near, far = (1 / d for d in self.depths)
         parts = np.unique(np.linspace(near, far, 1 if near == far else _DEPTHS))
         distances = [1 / p if p > 0 else math.inf for p in parts]
         rings = np.append(np.sqrt((np.arange(_RINGS) + 0.5) / _RINGS), 1.0)
-        fields, weights = np.arctan(np.tan(self.field) * rings), [1.0] * _RINGS + [_EDGE]
+        rings, weights = ([0.0, 1.0], None) if ends else (rings, [1.0] * _RINGS + [_EDGE])
+        fields = np.arctan(np.tan(self.field) * np.asarray(rings))
         scene = Scene.grid(fields, distances, self.waves, field_weights=weights)
         both = (*operands, *self.config.limits)
         return design.Problem.from_variables(variables, both, scene, order)
@@ -355,7 +360,7 @@ class Setup:
             rates["network"] = {"taps": setting.taps_rate, "network": setting.network_rate}
         if steps == "rays":
             size = design.cosine(1e-3 * setting.rays_um, setting.batches)
-            rates["optics"] = design.RaySteps(self.spots, self.limits, size)
+            rates["optics"] = design.RaySteps(self._metric, self.limits, size)
         elif not stays:
             falls = design.cosine(1.0, setting.batches, 1)
             lens: Any = self.rates
@@ -379,8 +384,8 @@ class Setup:
             return seen._replace(deviations=table[own])
 
         def hold(before: Any, after: Any) -> Any:
-            if stays:
-                return before
+            if stays or steps == "rays":  # steps of rays keep the limits themselves
+                return before if stays else after
             vector = jnp.where(before.get("moves", True), after["lens"], before["lens"])
             return before | {"lens": design.within_limits(self.limits, before["lens"], vector)}
 
