@@ -11,7 +11,7 @@ import experiments
 
 from . import _common
 
-_PREFIXES = "paper", "gpu"  # folders of results
+_PREFIXES = "paper", "gpu", "scenes"  # folders of results
 _BLOCK = re.compile(r"(<!-- table: (.+?) -->\n).*?(<!-- end -->)", re.DOTALL)
 
 
@@ -26,7 +26,8 @@ def all_tables() -> dict[str, str]:
     for path in sorted((_common.ROOT / "results").rglob("results.json")):
         experiment = _common.experiment(path.parent.name, path.parents[1].name)
         tables = experiment.tables(_common.read_results(path.parent))
-        # Those of configs/paper/ have the names of the shorter runs, those of a GPU of a CPU's.
+        # Those of configs/paper/ have the names of the shorter runs, those of a GPU of a CPU's, and
+        # those of more scenes of the benchmark's.
         of = path.parents[1].name
         prefix = f"{of}: " if of in _PREFIXES else ""
         found |= {prefix + name: table for name, table in tables.items()}

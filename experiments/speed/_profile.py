@@ -256,3 +256,12 @@ def reasons(rows: Sequence[Row]) -> str:
     counts = Counter((row["program"], row["why"]) for row in rows if row["why"])
     lines = [(*key, count) for key, count in counts.items()]
     return _common.table(("program", f"not to {TOLERANCES[0]:.0e} because", "scenes"), lines)
+
+
+def not_compared(rows: Sequence[Row]) -> str:
+    """Table of why scenes are left out, with the lenses."""
+    lines = [
+        (why, ", ".join(dict.fromkeys(row["lens"] for row in own)))
+        for (why,), own in _common.grouped(rows, "why").items()
+    ]
+    return _common.table(("not compared because", "lenses"), lines)

@@ -371,6 +371,7 @@ def tables(results: dict[str, Any]) -> dict[str, str]:
         "benchmark, curves": _curves.summary(results["curves"]),
         "benchmark, profile": _profile.summary(results["profile"]),
         "benchmark, unsolved": _profile.reasons(results["profile"]),
+        "benchmark, left out": _profile.not_compared(results["left_out"]),
         "benchmark, rates": _common.table(header_of_rates, rates),
         "benchmark": _common.table(header, lines),
         "benchmark, counts": _common.table(counts, results["counts"].items()),

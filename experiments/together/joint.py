@@ -300,13 +300,14 @@ def draw(results: dict[str, Any], figures: pathlib.Path) -> None:
         _report.draw_patches(parts, degrees, figures / f"patches_{arm}.png")
         errors[arm.replace("_", "\n")] = np.float32(parts["restored"])
     _plots.patch_grid(figures / "errors.png", degrees, truth, {}, errors)
-    if results["builds"]:
+    if any("each" in row for row in results["builds"]):
         with _plots.picture(figures / "builds.png", 6.5, 4.5) as (ax,):
             for (arm,), own in _common.grouped(results["builds"], "arm").items():
                 values = np.sort(np.ravel([row["each"] for row in own]))
                 ax.plot(values, np.linspace(100, 0, len(values)), label=titles[arm])
             _plots.label_axes(ax, "PSNR as built, at least (dB)", "lenses (%)")
-    _draw_photographs(results, scene, figures)
+    if "photographs" in results:
+        _draw_photographs(results, scene, figures)
 
 
 def _draw_photographs(results: dict[str, Any], scene: Scene, figures: pathlib.Path) -> None:
