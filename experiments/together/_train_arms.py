@@ -28,7 +28,7 @@ from .runs.folder import Run
 _APART = 10**7
 # Patches of a picture; of a photograph through two lenses its side, pixels, and its place in the
 # field.
-_SHOWN, _SIDE, _PLACE = 5, 192, 0.7
+_SHOWN, _SIDE, _PLACE = 5, 112, 0.9
 
 
 def run(config: Any, run: Run) -> dict[str, Any]:
@@ -177,7 +177,7 @@ def _pictures(setup: Setup, imager: Callable, parameters: Any) -> dict[str, np.n
 def _photograph(
     setup: Setup, side: int, trained: dict[tuple[str, int], Any], rows: list[dict]
 ) -> dict[str, Any]:
-    """A test photograph through two lenses, that of the first arm and the best, and through their
+    """Part of a test photograph through two lenses, that of the first arm and the best, and through their
     networks. Lenses as built have the errors of that one which ends the worst tenth of the first
     arm.
 
