@@ -38,6 +38,7 @@ from .tolerance import (
     draw_perturbations as draw_perturbations,
     monte_carlo as monte_carlo,
     predict as predict,
+    spots_as_built as spots_as_built,
     variances as variances,
     worst_case as worst_case,
 )

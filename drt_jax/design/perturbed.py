@@ -3,7 +3,7 @@
 import dataclasses
 import itertools
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from functools import partial
 from typing import Any, Literal, NamedTuple
 
@@ -308,17 +308,14 @@ class PerturbedLens:
                 )
                 sizes[deviation] = tolerance.size
         require(sizes, "tolerances: none; name at least one")
-        spans, kinds = elements_of(lens), {deviation.kind for deviation in sizes}
-        groups: tuple[int, ...] = ()
-        if any(KINDS[kind].whole == "element" for kind in kinds):
-            lens, groups = _with_elements(lens, spans)
-        if "wedge" in kinds:
-            lens = with_arrays(lens, ["tilt"])
-        if "irregularity" in kinds:
-            lens = _with_cylinders(lens)
-        dtype = lens.curvature.dtype
+        spans, dtype = elements_of(lens), lens.curvature.dtype
+        lens, groups = _with_parts(lens, spans, sizes)
         largest = jnp.asarray([*sizes.values()], dtype)
         return cls(lens, jnp.asarray(beam_radius, dtype), largest, tuple(sizes), spans, groups)
+
+    def around(self, lens: Lens) -> "PerturbedLens":
+        """The same deviations of another nominal lens with the same surfaces. Works in `jit`."""
+        return dataclasses.replace(self, lens=_with_parts(lens, self.spans, self.deviations)[0])
 
     @property
     def parts(self) -> list[list[int]]:
@@ -355,6 +352,21 @@ def _deviations_of(lens: Lens, tolerance: Tolerance) -> list[Deviation]:
         require(place in possible, f"{what}: no {kind.whole} {place} can deviate; there are {some}")
     places = itertools.product(tolerance.which or possible, range(kind.axes))
     return [Deviation(tolerance.kind, place, axis) for place, axis in places]
+
+
+def _with_parts(
+    lens: Lens, spans: tuple[tuple[int, int], ...], deviations: Iterable[Deviation]
+) -> tuple[Lens, tuple[int, ...]]:
+    """The same lens with all arrays that deviations need; and the groups of its elements, see
+    `PerturbedLens`."""
+    kinds, groups = {deviation.kind for deviation in deviations}, tuple[int, ...]()
+    if any(KINDS[kind].whole == "element" for kind in kinds):
+        lens, groups = _with_elements(lens, spans)
+    if "wedge" in kinds:
+        lens = with_arrays(lens, ["tilt"])
+    if "irregularity" in kinds:
+        lens = _with_cylinders(lens)
+    return lens, groups
 
 
 def _with_elements(lens: Lens, spans: tuple[tuple[int, int], ...]) -> tuple[Lens, tuple[int, ...]]:

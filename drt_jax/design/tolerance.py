@@ -7,6 +7,7 @@ the mean slope. So q is quadratic in the compensation, and the normal equations 
 least-squares problem give the optimal compensation.
 """
 
+import dataclasses
 from collections.abc import Callable
 from functools import partial
 from typing import Literal, NamedTuple, get_args
@@ -23,11 +24,13 @@ from ..devices import shared
 from ..image.spot import deviations, normalised
 from ..inputs import require, require_one_of
 from ..lens.lens import Lens
-from ..numerics import concrete, matmul, safe_divide, safe_sqrt
+from ..numerics import Numbers, concrete, matmul, real_array, safe_divide, safe_sqrt
+from ..pupil.rules import Gauss
+from ..rays.solve import solve_aimed
 from ..rays.status import Status
 from .field_rays import EXTRAS, FieldRays, symmetry_by_structure, trace_views
 from .perturbed import KINDS, PerturbedLens
-from .problem import Problem, quick
+from .problem import Problem, quick, trace_fields
 from .tiles import in_tiles
 
 # What is adjusted in every lens: the distance of the sensor, or also its tilts about x and y.
@@ -83,8 +86,8 @@ def _spots(rays: FieldRays) -> tuple[Array, Array, Array]:
     return offsets, growth, jnp.concatenate([jnp.zeros_like(centre[: 2 - len(hits)]), centre])
 
 
-def compensated(problem: Problem, lens: Lens, compensator: Compensator) -> tuple[AsBuilt, Array]:
-    """A lens after compensation, and its residuals. Call `check` before.
+def compensated(lens: Lens, rays: FieldRays, compensator: Compensator) -> tuple[AsBuilt, Array]:
+    """A lens with traced rays after compensation, and its residuals. Call `check` before.
 
     With the distances o and their derivatives g of all rays, and the shift of the sensor t_v =
     sum_k m_k l_kv at the spot of view v (levers l: 1, y and x of the centroid), the compensation m
@@ -93,7 +96,6 @@ def compensated(problem: Problem, lens: Lens, compensator: Compensator) -> tuple
     Returns the result, and the residuals (D, V, W Q): distances from the centroids, mm, whose
     squares add up to the squared RMS radii.
     """
-    rays = trace_views(lens, problem.views(), problem.solver)
     offsets, growth, (x, y) = _spots(rays)
     # At a spot (x, y) the sensor moves by d n + a y + b x along its normal, where d is the change
     # of `Lens.sensor`, n the normal component of the motion of the sensor, and a, b are the tilts.
@@ -129,7 +131,7 @@ def as_built(problem: Problem, lens: Lens, compensator: Compensator) -> AsBuilt:
     rule with more symmetry than the lens.
     """
     check(problem, lens, compensator)
-    return compensated(problem, lens, compensator)[0]
+    return compensated(lens, trace_fields(problem, lens), compensator)[0]
 
 
 def check(problem: Problem, lens: Lens, compensator: str) -> None:
@@ -252,9 +254,49 @@ def _many(
     """The lenses of one tile, shared among the devices of a mesh."""
 
     def one(problem: Problem, perturbed: PerturbedLens, row: Array) -> AsBuilt:
-        return compensated(problem, perturbed.lens_of(row), compensator)[0]
+        lens = perturbed.lens_of(row)
+        return compensated(lens, trace_fields(problem, lens), compensator)[0]
 
     return shared(jax.vmap(one, (None, None, 0)), mesh, 2)(problem, perturbed, perturbation)
+
+
+def spots_as_built(
+    perturbed: PerturbedLens,
+    perturbation: Numbers,
+    compensator: Literal["none", "focus"] = "focus",
+    order: int = 4,
+) -> Callable[[Lens, FieldRays], Array]:
+    """An operand of your own: the spots of lenses as built, for a design that stays good when it is
+    made.
+
+    Its squares are summed over all fields, distances and wavelengths of a problem, and averaged
+    over the lenses: the mean squared RMS radius after compensation, for each point. A ray that
+    fails in a lens as built counts nothing there.
+
+    perturbed: any lens of the same surfaces, and its deviations.
+    perturbation: (K, P), deviations in units of their largest, such as `draw_perturbations(
+        perturbed, 48, seed)`. Judge the design by others.
+    compensator: "focus": the sensor of each lens moves to its least spots; "none": it stays. Of the
+        design itself the sensor then does not matter: give it a solve, or a light "spot" beside.
+    order: of the pupil rule of each lens.
+    """
+    require_one_of("compensator", compensator, ("none", "focus"))
+    given = real_array("perturbation", perturbation, perturbed.sizes.dtype)
+    width = len(perturbed.deviations)
+    fits = given.ndim == 2 and len(given) > 0 and given.shape[1] == width
+    require(fits, f"perturbation: expected (K, {width}), got shape {given.shape}")
+    rule = Gauss(order, symmetry_by_structure(perturbed.lens))
+
+    def spots_as_built(lens: Lens, rays: FieldRays) -> Array:
+        nominal, views = perturbed.around(lens), dataclasses.replace(rays, rule=rule)
+
+        def residuals(row: Array) -> Array:
+            built = nominal.lens_of(row)
+            return compensated(built, trace_views(built, views, solve_aimed), compensator)[1]
+
+        return jax.vmap(residuals)(given) / len(given) ** 0.5
+
+    return spots_as_built
 
 
 class Predicted(NamedTuple):
@@ -339,7 +381,8 @@ def _predict(problem: Problem, perturbed: PerturbedLens, compensator: Compensato
     units = jnp.eye(len(zero), dtype=zero.dtype)
 
     def rays(perturbation: Array) -> tuple[tuple[Array, Array], Array]:
-        found, offsets = compensated(problem, perturbed.lens_of(perturbation), compensator)
+        lens = perturbed.lens_of(perturbation)
+        found, offsets = compensated(lens, trace_fields(problem, lens), compensator)
         return (jnp.ravel(offsets) / jnp.sqrt(len(found.squares)), found.moves), found.squares
 
     (offsets, moves), derivative, squares = jax.linearize(rays, zero, has_aux=True)

@@ -160,7 +160,6 @@ class Setup:
         if config.tolerances:
             radius = self.spots.beam_radius(lens)
             self.built = design.PerturbedLens.from_lens(lens, radius, config.tolerances)
-            self._whole = self._variables(self.built.lens, free=True)
 
     def _variables(
         self, lens: Lens, held: tuple[str, ...] = (), stop: float = 1.0, free: bool = False
@@ -227,35 +226,22 @@ class Setup:
         if name == "filter":
             return best(self.filtered, _JACOBIANS)
         if name in ("spots", "mtf", "built"):
-            aim: Any = "spot"
+            aims: list[Any] = ["spot"]
             if name == "mtf":
-                aim = design.Operand("mtf", target=1.0, at=self.config.mtf_at)
+                aims = [design.Operand("mtf", target=1.0, at=self.config.mtf_at)]
             if name == "built":
-                aim = design.Operand(self._spots_as_built())
-            return best(self._problem(self._variables(lens, held), aim))
+                some = design.draw_perturbations(self.built, _FEW, SEED + 2)
+                focus: Any = "focus" if self.config.refocus else "none"
+                spots = design.spots_as_built(self.built, some, focus, _COARSE)
+                # Of the lens itself a tenth: where all are refocused, nothing else moves its sensor.
+                aims = [design.Operand(spots), design.Operand("spot", weight=0.1**0.5)]
+            return best(self._problem(self._variables(lens, held), *aims))
         stops = {s: self._variables(lens, held, s) for s in self.config.stops}
         found = [best(self._problem(own, "spot")) for own in stops.values()]
         reached = [self.filter_db(vector) for vector in found]
         for stop, db in zip(stops, reached):
             print(f"stop {stop:g}: {db:.2f} dB behind the filter")
         return found[int(np.argmax(reached))]
-
-    def _spots_as_built(self) -> Callable[[Lens, Any], Array]:
-        """An operand: the spots of `_FEW` lenses as built."""
-        table = jnp.asarray(design.draw_perturbations(self.built, _FEW, SEED + 2))
-        whole = self._problem(self._whole, "spot", order=_COARSE)
-        spot = design.OPERANDS["spot"].function
-
-        def spots_as_built(lens: Lens, rays: Any) -> Array:
-            vector = self.variables.vector(lens)
-
-            def one(deviations: Array) -> Array:
-                built = self.lens_of(vector, deviations)
-                return spot(built, design.trace_fields(whole, built))
-
-            return jax.vmap(one)(table) / math.sqrt(_FEW)
-
-        return spots_as_built
 
     @functools.cached_property
     def rates(self) -> Array:
@@ -294,8 +280,8 @@ class Setup:
         """The lens of a vector, as designed or with deviations."""
         if deviations is None:
             return self.variables.lens_of(vector)
-        lens = self._whole.lens_of(vector)
-        built = dataclasses.replace(self.built, lens=lens).lens_of(deviations)
+        lens = self.variables.lens_of(vector)
+        built = self.built.around(lens).lens_of(deviations)
         if not self.config.refocus:
             return built
         focus = [

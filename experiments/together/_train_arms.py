@@ -65,7 +65,7 @@ def run(config: Any, run: Run) -> dict[str, Any]:
     for arm in arms:
         images = _pictures(setup, imager, trained[arm, 0])
         pictures |= {f"{arm} {name}": array[some] for name, array in images.items()}
-    builds = _as_built(setup, run, trained) if config.judge.builds else []
+    builds = _as_built(setup, run, trained, test.get("others")) if config.judge.builds else []
     return {
         **about,
         "rows": rows,
@@ -177,9 +177,9 @@ def _pictures(setup: Setup, imager: Callable, parameters: Any) -> dict[str, np.n
 def _photograph(
     setup: Setup, side: int, trained: dict[tuple[str, int], Any], rows: list[dict]
 ) -> dict[str, Any]:
-    """Part of a test photograph through two lenses, that of the first arm and the best, and through their
-    networks. Lenses as built have the errors of that one which ends the worst tenth of the first
-    arm.
+    """Part of a test photograph through two lenses, that of the first arm and the best, and through
+    their networks. Lenses as built have the errors of that one which ends the worst tenth of the
+    first arm.
 
     rows: of lenses as built, or of arms.
     """
@@ -207,23 +207,31 @@ def _built_lenses(setup: Setup) -> np.ndarray:
     return design.draw_perturbations(setup.built, setup.config.judge.builds, SEED + 1)
 
 
-def _as_built(setup: Setup, run: Run, trained: dict[tuple[str, int], Any]) -> list[dict]:
+def _as_built(
+    setup: Setup, run: Run, trained: dict[tuple[str, int], Any], others: np.ndarray | None
+) -> list[dict]:
     """PSNR of lenses as built, of arms that begin with a lens whose spots are finished, by rays at
-    the points of the judge."""
+    the points of the judge; with prefix `others_` of other photographs."""
     imager = jax.jit(FieldImager(setup.points, setup.restore).__call__)
     rows = []
     for (arm, seed), parameters in trained.items():
         if ARMS[arm].begins in ("spots", "built") and not ARMS[arm].frozen:
-            job = f"built {arm} {seed}"
-            own = run.once(job, lambda: _decibels(setup, imager, parameters, job))
-            rows.append({"arm": arm, "seed": seed} | own)
+            job, row = f"built {arm} {seed}", {"arm": arm, "seed": seed}
+            for prefix, patches in (("", setup.patches.test), ("others_", others)):
+                if patches is not None:
+                    judge = partial(_decibels, setup, imager, parameters, patches, prefix + job)
+                    found = run.once(prefix + job, judge)
+                    row |= {prefix + key: value for key, value in found.items()}
+            rows.append(row)
     return rows
 
 
-def _decibels(setup: Setup, imager: Callable, parameters: Any, job: str) -> dict[str, Any]:
+def _decibels(
+    setup: Setup, imager: Callable, parameters: Any, patches: np.ndarray, job: str
+) -> dict[str, Any]:
     """PSNR of the lens as designed; of lenses as built each, the mean, and the 10th percentile."""
     table = _built_lenses(setup)
-    patches = _training.thinned(setup.patches.test, len(setup.judged.fields))
+    patches = _training.thinned(patches, len(setup.judged.fields))
     patches, found = _one_each(setup, patches), []
     noise, key = np.float32(setup.noise), jax.random.key(0)
     for deviations in (np.zeros(table.shape[1]), *tqdm(table, desc=job, leave=False)):

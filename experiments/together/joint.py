@@ -234,9 +234,12 @@ def tables(results: dict[str, Any]) -> dict[str, str]:
         found[f"joint, {name}: before training"] = _common.table(header, lines)
     if results["builds"]:
         header = ["arm", "PSNR dB as designed", "mean as built", "10th percentile"]
-        lines = []
+        keys, lines = ["designed", "mean", "low"], []
+        if "others_mean" in results["builds"][0]:
+            header += ["of other photographs: mean", "10th percentile"]
+            keys += ["others_mean", "others_low"]
         for (arm,), own in _common.grouped(results["builds"], "arm").items():
-            parts = [[row[key] for row in own] for key in ("designed", "mean", "low")]
+            parts = [[row[key] for row in own] for key in keys]
             lines.append([ARMS[arm].title, *(_spread(part, 2) for part in parts)])
         found[f"joint, {name}: as built"] = _common.table(header, lines)
     return found

@@ -197,6 +197,43 @@ def test_predictions_are_monte_carlo(singlet, predicted):
     np.testing.assert_allclose(moves, linear, atol=0.02 * np.std(moves))
 
 
+@pytest.mark.parametrize("compensator", ["none", pytest.param("focus", marks=pytest.mark.slow)])
+def test_spots_of_lenses_as_built_as_an_operand(singlet, compensator):
+    """Its merit is that of a Monte Carlo run, and so is its derivative."""
+    problem, some = singlet
+    off = design.draw_perturbations(some, 7, 5)
+    operand = design.Operand(design.spots_as_built(some, off, compensator, order=3))
+    variables = Variables.from_lens(SINGLET, ["curvature", "sensor"])
+    scene = Scene.radians(FIELDS, np.inf, COLOURS)
+    built = Problem.from_variables(variables, [operand], scene, 3)
+
+    def traced(vector):
+        around = some.around(variables.lens_of(vector))
+        found = design.monte_carlo(problem, around, off, compensator)
+        return float(np.sum(np.mean(found.squares, axis=0)))
+
+    start = variables.start
+    merit, slopes = jax.jit(jax.value_and_grad(built.merit))(start)
+    assert float(merit) == pytest.approx(traced(start), rel=1e-10)
+    steps = 1e-5 * np.eye(len(start))
+    wanted = [(traced(start + step) - traced(start - step)) / 2e-5 for step in steps]
+    np.testing.assert_allclose(slopes, wanted, rtol=1e-5)
+
+
+@pytest.mark.parametrize(
+    "change, told",
+    [
+        ({"perturbation": np.zeros((0, 3))}, r"perturbation: expected \(K, 13\), got shape"),
+        ({"compensator": "focus and tilt"}, "compensator: expected one of none, focus"),
+    ],
+)
+def test_lenses_as_built_that_are_no_operand(singlet, change, told):
+    width = len(singlet[1].deviations)
+    given = {"perturbation": np.zeros((2, width))} | change
+    with pytest.raises(ValueError, match=told.replace("13", str(width))):
+        design.spots_as_built(singlet[1], **given)
+
+
 @pytest.mark.parametrize("word", ["gradient", "second derivatives", "", 2, None])
 def test_orders_that_are_unknown_are_refused(word):
     """They silently gave the second one."""
