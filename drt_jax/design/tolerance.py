@@ -263,7 +263,7 @@ def _many(
 def spots_as_built(
     perturbed: PerturbedLens,
     perturbation: Numbers,
-    compensator: Literal["none", "focus"] = "focus",
+    compensator: Literal["none", "focus"] | Callable[[Lens, Lens], Lens] = "focus",
     order: int = 4,
 ) -> Callable[[Lens, FieldRays], Array]:
     """An operand of your own: the spots of lenses as built, for a design that stays good when it is
@@ -276,11 +276,14 @@ def spots_as_built(
     perturbed: any lens of the same surfaces, and its deviations.
     perturbation: (K, P), deviations in units of their largest, such as `draw_perturbations(
         perturbed, 48, seed)`. Judge the design by others.
-    compensator: "focus": the sensor of each lens moves to its least spots; "none": it stays. Of the
-        design itself the sensor then does not matter: give it a solve, or a light "spot" beside.
+    compensator: "none"; "focus": the sensor of each lens moves to its least spots, so that the
+        sensor of the design does not matter: give it a solve, or a light "spot" beside; or a
+        function of the design and of a lens as built, that returns this lens adjusted.
     order: of the pupil rule of each lens.
     """
-    require_one_of("compensator", compensator, ("none", "focus"))
+    adjust = compensator if callable(compensator) else None
+    kind: Compensator = "none" if callable(compensator) else compensator
+    require_one_of("compensator", kind, ("none", "focus"))
     given = real_array("perturbation", perturbation, perturbed.sizes.dtype)
     width = len(perturbed.deviations)
     fits = given.ndim == 2 and len(given) > 0 and given.shape[1] == width
@@ -292,7 +295,8 @@ def spots_as_built(
 
         def residuals(row: Array) -> Array:
             built = nominal.lens_of(row)
-            return compensated(built, trace_views(built, views, solve_aimed), compensator)[1]
+            built = adjust(nominal.lens, built) if adjust else built
+            return compensated(built, trace_views(built, views, solve_aimed), kind)[1]
 
         return jax.vmap(residuals)(given) / len(given) ** 0.5
 

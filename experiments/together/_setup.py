@@ -231,10 +231,8 @@ class Setup:
                 aims = [design.Operand("mtf", target=1.0, at=self.config.mtf_at)]
             if name == "built":
                 some = design.draw_perturbations(self.built, _FEW, SEED + 2)
-                focus: Any = "focus" if self.config.refocus else "none"
-                spots = design.spots_as_built(self.built, some, focus, _COARSE)
-                # Of the lens itself a tenth: where all are refocused, nothing else moves its sensor.
-                aims = [design.Operand(spots), design.Operand("spot", weight=0.1**0.5)]
+                spots = design.spots_as_built(self.built, some, self._refocused, _COARSE)
+                aims = [design.Operand(spots)]
             return best(self._problem(self._variables(lens, held), *aims))
         stops = {s: self._variables(lens, held, s) for s in self.config.stops}
         found = [best(self._problem(own, "spot")) for own in stops.values()]
@@ -280,8 +278,11 @@ class Setup:
         """The lens of a vector, as designed or with deviations."""
         if deviations is None:
             return self.variables.lens_of(vector)
-        lens = self.variables.lens_of(vector)
-        built = self.built.around(lens).lens_of(deviations)
+        around = self.built.around(self.variables.lens_of(vector))
+        return self._refocused(around.lens, around.lens_of(deviations))
+
+    def _refocused(self, lens: Lens, built: Lens) -> Lens:
+        """A lens as built, with the sensor at its own paraxial focus if that is asked for."""
         if not self.config.refocus:
             return built
         focus = [

@@ -270,9 +270,11 @@ def draw(results: dict[str, Any], figures: pathlib.Path) -> None:
         groups = _common.grouped(results["map"], "near_m")
         with _plots.picture(figures / "map.png", 4.5, 4, len(groups), 3) as axes:
             for ax, ((near,), own) in zip(axes, groups.items()):
+                noise = [row["noise"] for row in own]
                 for name in own[0]["lenses"]:
-                    values = [row["lenses"][name][0] for row in own]
-                    ax.semilogx([row["noise"] for row in own], values, "o-", label=name)
+                    ax.semilogx(noise, [row["lenses"][name][0] for row in own], "o-", label=name)
+                ax.set_xticks(noise, [f"{value:g}" for value in noise])
+                ax.minorticks_off()
                 ax.set_title(f"{near:g} m to infinity")
                 _plots.label_axes(ax, "noise", "PSNR behind the best filter (dB)")
     if not results["rows"]:
