@@ -47,7 +47,7 @@ ALLOWED_ALL = {"learn.__init__", "show.layout", "show.analyses", "show.sheet", "
 ROOMS = {
     "drt_jax": 554,
     "drt_jax/check": 298,
-    "drt_jax/design": 2467,
+    "drt_jax/design": 2496,
     "drt_jax/files": 2928,
     "drt_jax/image": 3041,
     "drt_jax/learn": 656,
@@ -60,8 +60,8 @@ ROOMS = {
     "experiments/imaging": 461,
     "experiments/paper": 608,
     "experiments/runs": 453,
-    "experiments/speed": 1432,
-    "experiments/together": 522,
+    "experiments/speed": 1439,
+    "experiments/together": 681,
     "experiments/trust": 1992,
 }
 PUBLIC = 60
