@@ -11,6 +11,7 @@ import dataclasses
 import itertools
 import math
 import pathlib
+import re
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
@@ -222,7 +223,8 @@ def jobs(sizes: Profile) -> dict[str, Callable]:
 def ratios(rows: Sequence[Row], k: int) -> dict[str, np.ndarray]:
     """By program, its time over that of the fastest in each scene whose reference is known well
     enough for TOLERANCES[k]; inf where it is not solved."""
-    known = [row for row in rows if 3 * row["reference_error"] < TOLERANCES[k]]
+    errors = ((row, row["reference_error"]) for row in rows)
+    known = [row for row, error in errors if error is not None and 3 * error < TOLERANCES[k]]
     seconds: dict[str, list[float]] = {}
     for row in known:
         time_of = row["quartiles_s"][k]
@@ -261,7 +263,7 @@ def reasons(rows: Sequence[Row]) -> str:
 def not_compared(rows: Sequence[Row]) -> str:
     """Table of why scenes are left out, with the lenses."""
     lines = [
-        (why, ", ".join(dict.fromkeys(row["lens"] for row in own)))
+        (re.sub(r"\S*/", "", why), ", ".join(dict.fromkeys(row["lens"] for row in own)))
         for (why,), own in _common.grouped(rows, "why").items()
     ]
     return _common.table(("not compared because", "lenses"), lines)

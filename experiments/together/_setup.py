@@ -371,8 +371,8 @@ class Setup:
             return seen._replace(deviations=table[own])
 
         def hold(before: Any, after: Any) -> Any:
-            if stays or steps == "rays":  # steps of rays keep the limits themselves
-                return before if stays else after
+            if stays:
+                return before
             vector = jnp.where(before.get("moves", True), after["lens"], before["lens"])
             return before | {"lens": design.within_limits(self.limits, before["lens"], vector)}
 
