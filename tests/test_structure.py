@@ -60,8 +60,8 @@ ROOMS = {
     "experiments/imaging": 461,
     "experiments/paper": 608,
     "experiments/runs": 453,
-    "experiments/speed": 1439,
-    "experiments/together": 681,
+    "experiments/speed": 1443,
+    "experiments/together": 685,
     "experiments/trust": 1992,
 }
 PUBLIC = 60

@@ -366,16 +366,19 @@ def tables(results: dict[str, Any]) -> dict[str, str]:
         if "ours_surfaces_per_s" in row
     ]
     header_of_rates = "work", "drt_jax, 1e6 rays x surfaces / s", "batoid"
-    return {
-        "benchmark, machine": _common.table(("machine of this run",), machine),
-        "benchmark, curves": _curves.summary(results["curves"]),
-        "benchmark, profile": _profile.summary(results["profile"]),
-        "benchmark, unsolved": _profile.reasons(results["profile"]),
-        "benchmark, left out": _profile.not_compared(results["left_out"]),
-        "benchmark, rates": _common.table(header_of_rates, rates),
-        "benchmark": _common.table(header, lines),
-        "benchmark, counts": _common.table(counts, results["counts"].items()),
-    }
+    found = {"benchmark, machine": _common.table(("machine of this run",), machine)}
+    if results["curves"]:
+        found["benchmark, curves"] = _curves.summary(results["curves"])
+    if results["profile"]:
+        found["benchmark, profile"] = _profile.summary(results["profile"])
+        found["benchmark, unsolved"] = _profile.reasons(results["profile"])
+    if results["left_out"]:
+        found["benchmark, left out"] = _profile.not_compared(results["left_out"])
+    if results["rows"]:
+        found["benchmark, rates"] = _common.table(header_of_rates, rates)
+        found["benchmark"] = _common.table(header, lines)
+        found["benchmark, counts"] = _common.table(counts, results["counts"].items())
+    return found
 
 
 def draw(results: dict[str, Any], figures: pathlib.Path) -> None:

@@ -17,7 +17,7 @@ from tqdm import tqdm
 import drt_jax
 from drt_jax import design
 from drt_jax.learn import train
-from drt_jax.learn.data import DataConfig, batches, load_patches
+from drt_jax.learn.data import DataConfig, DataError, batches, load_patches
 from drt_jax.learn.field import FieldImager, ObjectPoints
 
 from . import _common, _training
@@ -177,7 +177,7 @@ def _pictures(setup: Setup, imager: Callable, parameters: Any) -> dict[str, np.n
 def _photograph(
     setup: Setup, side: int, trained: dict[tuple[str, int], Any], rows: list[dict]
 ) -> dict[str, Any]:
-    """Part of a test photograph through two lenses, that of the first arm and the best, and through
+    """Part of a photograph through two lenses, that of the first arm and the best, and through
     their networks. Lenses as built have the errors of that one which ends the worst tenth of the
     first arm.
 
@@ -191,7 +191,11 @@ def _photograph(
     if measure == "low":
         table, each = _built_lenses(setup), rows[0]["each"]
         errors = jnp.asarray(table[np.argsort(each)[len(each) // 10]])
-    every = load_patches(config.data, side - config.train.patch + _SIDE, 0).test
+    try:
+        few = dataclasses.replace(config.data, crops_per_image=8)
+        every = load_patches(few, side - config.train.patch + _SIDE, 0).test
+    except DataError:  # the photographs are too small
+        every = setup.patches.test
     scene = every[[int(np.argmax(np.std(every, axis=(1, 2, 3))))]]
     field = jnp.array([[0.0, math.atan(_PLACE * math.tan(setup.field))]])
     seen = ObjectPoints(field, jnp.array([setup.depths[1]]), errors)
