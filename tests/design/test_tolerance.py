@@ -224,7 +224,8 @@ def test_spots_of_lenses_as_built_as_an_operand(singlet, compensator, given):
     assert float(merit) == pytest.approx(traced(start), rel=1e-10)
     steps = 1e-5 * np.eye(len(start))
     wanted = [(traced(start + step) - traced(start - step)) / 2e-5 for step in steps]
-    np.testing.assert_allclose(slopes, wanted, rtol=1e-5)
+    # Refocused, the sensor of the design does not matter.
+    np.testing.assert_allclose(slopes, wanted, rtol=1e-5, atol=1e-8 * np.max(np.abs(wanted)))
 
 
 @pytest.mark.parametrize(
