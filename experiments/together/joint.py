@@ -275,7 +275,7 @@ def draw(results: dict[str, Any], figures: pathlib.Path) -> None:
                     ax.semilogx(noise, [row["lenses"][name][0] for row in own], "o-", label=name)
                 ax.set_xticks(noise, [f"{value:g}" for value in noise])
                 ax.minorticks_off()
-                ax.set_title(f"{near:g} m to infinity")
+                ax.set_title(f"{near:g} m to infinity" if near < math.inf else "far objects")
                 _plots.label_axes(ax, "noise", "PSNR behind the best filter (dB)")
     if not results["rows"]:
         return
