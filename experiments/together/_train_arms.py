@@ -102,7 +102,8 @@ def _map(setup: Setup, run: Run) -> list[dict[str, Any]]:
             return found
 
         lenses = run.once(f"map {what}", measured)
-        rows.append({"near_m": near, "noise": noise, "lenses": lenses})
+        nearest = near if math.isfinite(near) else None
+        rows.append({"near_m": nearest, "noise": noise, "lenses": lenses})
     return rows
 
 

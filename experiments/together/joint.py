@@ -252,7 +252,8 @@ def _map_table(rows: list[dict[str, Any]]) -> str:
         cells = [f"{db:.2f} (f/{number:.1f})" for db, number in row["lenses"].values()]
         best, *others = (row["lenses"][name][0] for name in ("filter", "freed", "stopped"))
         gains = [f"{best - other:+.2f}" for other in others]
-        lines.append([f"{row['near_m']:g}", f"{row['noise']:g}", *cells, *gains])
+        near = row["near_m"] or math.inf
+        lines.append([f"{near:g}", f"{row['noise']:g}", *cells, *gains])
     header = ["nearest, m", "noise", *rows[0]["lenses"], "filter less freed", "less stopped"]
     return _common.table(header, lines)
 
@@ -275,7 +276,7 @@ def draw(results: dict[str, Any], figures: pathlib.Path) -> None:
                     ax.semilogx(noise, [row["lenses"][name][0] for row in own], "o-", label=name)
                 ax.set_xticks(noise, [f"{value:g}" for value in noise])
                 ax.minorticks_off()
-                ax.set_title(f"{near:g} m to infinity" if near < math.inf else "far objects")
+                ax.set_title(f"{near:g} m to infinity" if near else "far objects")
                 _plots.label_axes(ax, "noise", "PSNR behind the best filter (dB)")
     if not results["rows"]:
         return

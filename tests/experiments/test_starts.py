@@ -216,7 +216,7 @@ def test_a_filter_in_front_of_the_network_and_the_best_stop(tmp_path):
         *("camera.kind=waves", "train.patch=48"),
         "arms=[stopped, freed, filter, rays_from_filter]",
         "judge={rings: 2, patches: 1, waves: 2, cells: 64, others: " + str(photos) + "}",
-        "map={noise: [0.02], near_m: [20]}",
+        "map={noise: [0.02], near_m: [.inf]}",
     ]
     experiment, out = importlib.import_module("experiments.joint"), tmp_path / "run"
     _command.main(experiment, ["--out", str(out), "--set", *own])
