@@ -1,6 +1,7 @@
 """Designing a lens: variables, operands, least squares, many starts, tolerances."""
 
 from . import least_squares as least_squares
+from .compensation import AsBuilt as AsBuilt, as_built as as_built
 from .field_rays import FieldRays as FieldRays
 from .glasses import (
     Snap as Snap,
@@ -32,9 +33,7 @@ from .starts import (
     sobol_starts as sobol_starts,
 )
 from .tolerance import (
-    AsBuilt as AsBuilt,
     Predicted as Predicted,
-    as_built as as_built,
     draw_perturbations as draw_perturbations,
     monte_carlo as monte_carlo,
     predict as predict,

@@ -1,10 +1,7 @@
-"""A lens as built: its spots after compensation, by Monte Carlo simulation and by derivatives.
+"""Many lenses as built: by Monte Carlo simulation, by derivatives, and as an operand of a design.
 
 The figure of merit q of a lens is the mean over its fields of the squared RMS radius of the
-polychromatic spot, after optimal compensation. The distance o of a ray from the centroid changes
-linearly with the shift t of the sensor at the spot, o + g t, where g is the slope of the ray less
-the mean slope. So q is quadratic in the compensation, and the normal equations of a small linear
-least-squares problem give the optimal compensation.
+polychromatic spot, after compensation, see `compensation`.
 """
 
 import dataclasses
@@ -21,135 +18,22 @@ from scipy.special import gammainc
 
 from ..compilation import LARGE, ONCE, jit
 from ..devices import shared
-from ..image.spot import deviations, normalised
 from ..inputs import require, require_one_of
 from ..lens.lens import Lens
-from ..numerics import Numbers, concrete, matmul, real_array, safe_divide, safe_sqrt
+from ..numerics import Numbers, concrete, matmul, real_array
 from ..pupil.rules import Gauss
 from ..rays.solve import solve_aimed
-from ..rays.status import Status
-from .field_rays import EXTRAS, FieldRays, symmetry_by_structure, trace_views
+from .compensation import AsBuilt, Compensator, check, compensated
+from .field_rays import FieldRays, symmetry_by_structure, trace_views
 from .perturbed import KINDS, PerturbedLens
 from .problem import Problem, quick, trace_fields
 from .tiles import in_tiles
 
-# What is adjusted in every lens: the distance of the sensor, or also its tilts about x and y.
-Compensator = Literal["none", "focus", "focus and tilt"]
-_STEPS = {"none": 0, "focus": 1, "focus and tilt": 3}
-_SYMMETRIES = ("rotational", "bilateral", "none")  # by the traced part of the pupil, smallest first
 _TILE = 50  # number of lenses in a tile
 _DEVIATION = 0.5  # standard deviation of normal deviations, in units of the largest
 # Order of a prediction: gradient of q, Gauss-Newton part of its Hessian, or whole Hessian.
 Order = Literal["first", "rays", "second"]
 _ASCENTS = 16  # number of eigenvectors from which ascents start, in both directions
-
-
-class AsBuilt(NamedTuple):
-    """A lens as built, after compensation.
-
-    squares: (V,), squared RMS radii of the spots, mm^2; inf where rays fail or no light passes.
-    moves: (C,), compensation: the shift of the sensor, mm, then its tilts about x and -y, radians.
-    """
-
-    squares: Array
-    moves: Array
-
-    @property
-    def spot(self) -> Array:
-        """The square root of q, (), mm."""
-        return jnp.sqrt(jnp.mean(self.squares, axis=-1))
-
-
-def _spots(rays: FieldRays) -> tuple[Array, Array, Array]:
-    """Distances of rays from the centroid of their view, and the derivatives of these distances.
-
-    Returns distances, mm, and their derivatives by the shift of the sensor, (D, V, W Q) each, times
-    the root of the weight of the ray; and the centroids (2, V), mm.
-    """
-    waves = rays.wavelength_weights[None, :, None]
-    light = (rays.weights * waves)[..., EXTRAS:]
-    passes = (rays.bundle.status == Status.OK)[..., EXTRAS:] & (light > 0)
-    light = jnp.where(passes, light, 0)
-    arrival = [a[..., EXTRAS:] for a in rays.bundle.arrival]
-    hits = [h[:, -1, :, EXTRAS:] for h in rays.bundle.hits]
-    slopes = [safe_divide(a, arrival[-1]) for a in arrival[:-1]]
-    weight = normalised(light, (-2, -1))
-    root = safe_sqrt(weight)
-
-    def scaled(values: list[Array]) -> tuple[Array, tuple[Array, ...]]:
-        known = tuple(jnp.where(passes, value, 0) for value in values)
-        parts, means = deviations(known, weight, rays.symmetry, (-2, -1))
-        return jnp.stack([root * part for part in parts]).reshape(len(hits), len(light), -1), means
-
-    (offsets, means), (growth, _) = scaled(hits), scaled(slopes)
-    centre = jnp.stack(means)[..., 0, 0]
-    return offsets, growth, jnp.concatenate([jnp.zeros_like(centre[: 2 - len(hits)]), centre])
-
-
-def compensated(lens: Lens, rays: FieldRays, compensator: Compensator) -> tuple[AsBuilt, Array]:
-    """A lens with traced rays after compensation, and its residuals. Call `check` before.
-
-    With the distances o and their derivatives g of all rays, and the shift of the sensor t_v =
-    sum_k m_k l_kv at the spot of view v (levers l: 1, y and x of the centroid), the compensation m
-    solves (sum g^2 l l^T) m = -sum o g l.
-
-    Returns the result, and the residuals (D, V, W Q): distances from the centroids, mm, whose
-    squares add up to the squared RMS radii.
-    """
-    offsets, growth, (x, y) = _spots(rays)
-    # At a spot (x, y) the sensor moves by d n + a y + b x along its normal, where d is the change
-    # of `Lens.sensor`, n the normal component of the motion of the sensor, and a, b are the tilts.
-    motion = lens.sensor_motion
-    normal = jnp.ones_like(x) if motion is None else jnp.broadcast_to(motion[2], x.shape)
-    levers = jnp.stack([normal, y, x])[: _STEPS[compensator]]
-    moves = jnp.zeros(0, x.dtype)
-    if len(levers):
-        square = jnp.sum(growth**2, axis=(0, 2))
-        matrix = matmul(levers * square[None], levers.T)
-        lit = matrix[0, 0] > 0
-        matrix = jnp.where(lit, matrix, jnp.eye(len(levers), dtype=x.dtype))
-        moves = jnp.linalg.solve(matrix, -matmul(levers, jnp.sum(offsets * growth, axis=(0, 2))))
-        offsets = offsets + growth * matmul(moves, levers)[None, :, None]
-    light = rays.weights[..., EXTRAS:] > 0
-    failed = jnp.any(light & ~rays.arrives[..., EXTRAS:], axis=(1, 2))
-    valid = ~failed & jnp.all(rays.throughput > 0, axis=1)
-    squares = jnp.where(valid, jnp.sum(offsets**2, axis=(0, 2)), jnp.inf)
-    return AsBuilt(squares, moves), offsets
-
-
-def as_built(problem: Problem, lens: Lens, compensator: Compensator) -> AsBuilt:
-    """Evaluates a lens at the fields of a problem after compensation.
-
-    Works in `jit`, `vmap` and under differentiation.
-
-    problem: gives the fields, wavelengths and pupil rule.
-    lens: the lens as built.
-    compensator: "none", "focus" (the distance of the sensor) or "focus and tilt" (also its tilts
-        about x and y).
-
-    ValueError for an unknown compensator, for one that the fields do not determine, and for a pupil
-    rule with more symmetry than the lens.
-    """
-    check(problem, lens, compensator)
-    return compensated(lens, trace_fields(problem, lens), compensator)[0]
-
-
-def check(problem: Problem, lens: Lens, compensator: str) -> None:
-    """Raises the ValueErrors of `as_built`."""
-    require_one_of("compensator", compensator, get_args(Compensator))
-    has, needs = problem.rule.symmetry, symmetry_by_structure(lens, axial=True)
-    require(
-        _SYMMETRIES.index(has) >= _SYMMETRIES.index(needs),
-        f'rule: "{has}" leaves out part of the pupil, but deviations break the symmetry; use one '
-        f'of symmetry "{needs}", such as Gauss(6, "{needs}")',
-    )
-    if compensator == "focus and tilt" and concrete(problem.fields):
-        tangents = np.tan(np.asarray(problem.fields, float))
-        require(
-            np.linalg.matrix_rank(np.c_[np.ones(len(tangents)), tangents]) == 3,
-            "compensator: focus and tilt: the fields lie on a line, about which any tilt is as "
-            "good; add fields beside it",
-        )
 
 
 def draw_perturbations(
@@ -273,7 +157,8 @@ def spots_as_built(
     over the lenses: the mean squared RMS radius after compensation, for each point. A ray that
     fails in a lens as built counts nothing there.
 
-    perturbed: any lens of the same surfaces, and its deviations.
+    perturbed: any lens of the same surfaces, and its deviations. ValueError of the merit for a lens
+        of others.
     perturbation: (K, P), deviations in units of their largest, such as `draw_perturbations(
         perturbed, 48, seed)`. Judge the design by others.
     compensator: "none"; "focus": the sensor of each lens moves to its least spots, so that the
@@ -291,6 +176,8 @@ def spots_as_built(
     rule = Gauss(order, symmetry_by_structure(perturbed.lens))
 
     def spots_as_built(lens: Lens, rays: FieldRays) -> Array:
+        own, other = perturbed.lens.count, lens.count
+        require(own == other, f"perturbed: a lens of {own} surfaces, the design has {other}")
         nominal, views = perturbed.around(lens), dataclasses.replace(rays, rule=rule)
 
         def residuals(row: Array) -> Array:

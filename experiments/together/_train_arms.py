@@ -22,6 +22,7 @@ from drt_jax.learn.field import FieldImager, ObjectPoints
 
 from . import _common, _training
 from ._setup import ARMS, SEED, Setup
+from .runs.config import ConfigError
 from .runs.folder import Run
 
 # Steps between those of two seeds, which points and noise depend on.
@@ -34,6 +35,7 @@ _SHOWN, _SIDE, _PLACE = 5, 112, 0.9
 def run(config: Any, run: Run) -> dict[str, Any]:
     """Finishes the lenses, trains and judges all arms."""
     side = config.train.patch + config.camera.kernel - 1 + max(config.taps - 1, 0)
+    others = _others(config.judge.others, side, run)
     setup = Setup(config, _training.read_patches(config.data, side, 0, run.folder))
     about = _common.settings(config, "name", "field_deg") | {"map": _map(setup, run)}
     if not config.arms:
@@ -43,7 +45,7 @@ def run(config: Any, run: Run) -> dict[str, Any]:
     (run.folder / "lenses").mkdir(exist_ok=True)
     _save(setup, run, "spoilt", setup.spoilt)
     imager = jax.jit(FieldImager(setup.judged_points, setup.restore).__call__)
-    test = {"": setup.patches.test} | _others(config, side, run)
+    test = {"": setup.patches.test} | others
     rows, losses, trained = [], [], {}
     arms = [arm for arm in ARMS if arm in config.arms]  # `frozen` after `spots`
     jobs = {(arm, seed): f"{arm} {seed}" for arm in arms for seed in range(config.seeds)}
@@ -138,15 +140,18 @@ def _save(setup: Setup, run: Run, name: str, vector: Array) -> None:
     drt_jax.save_lens(lens, run.folder / "lenses" / f"{name}.yaml")
 
 
-def _others(config: Any, side: int, run: Run) -> dict[str, np.ndarray]:
-    """Patches of `judge.others`, of each image one: all, and the thirds with the least and the most
-    colour; {} without."""
-    if not config.judge.others:
+def _others(folder: str, side: int, run: Run) -> dict[str, np.ndarray]:
+    """A patch of each photograph of `judge.others`: all, and the thirds with the least and the most
+    colour; {} for no folder. ConfigError for one that cannot be used."""
+    if not folder:
         return {}
-    data = DataConfig(config.judge.others, 1, 0.99)
-    every = _training.read_patches(data, side, 0, run.folder).test
-    colour = np.argsort(np.mean(np.ptp(every, axis=-1), axis=(1, 2)))
+    try:
+        every = _training.read_patches(DataConfig(folder, 1, 0.99), side, 0, run.folder).test
+    except DataError as error:
+        raise ConfigError(str(error).replace("data.root", "judge.others")) from error
     third = len(every) // 3
+    _common.require(third > 0, f"judge.others: {folder}: expected four photographs or more")
+    colour = np.argsort(np.mean(np.ptp(every, axis=-1), axis=(1, 2)))
     return {"others": every, "grey": every[colour[:third]], "coloured": every[colour[-third:]]}
 
 

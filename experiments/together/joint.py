@@ -202,7 +202,7 @@ class Config:
 def tables(results: dict[str, Any]) -> dict[str, str]:
     """Errors of all arms, and their differences from the finished lens."""
     name, found = results["name"], {}
-    if results.get("map"):
+    if results.get("map"):  # older runs have no key
         found[f"joint, {name}: map"] = _map_table(results["map"])
     if not results["rows"]:
         return found
@@ -227,7 +227,7 @@ def tables(results: dict[str, Any]) -> dict[str, str]:
             for (arm,), own in groups.items()
         ]
         found[f"joint, {name}: other photographs"] = _common.table(header, lines)
-    behind = results.get("filter_db", {})  # older runs have none
+    behind = results["filter_db"]
     if any(behind.values()):
         lines = [[key, f"{db:.2f}"] for key, db in behind.items()]
         header = ["lens", "PSNR dB behind its best filter, closed form"]
@@ -236,7 +236,7 @@ def tables(results: dict[str, Any]) -> dict[str, str]:
         header = ["arm", "PSNR dB as designed", "mean as built", "10th percentile"]
         keys, lines = ["designed", "mean", "low"], []
         if "others_mean" in results["builds"][0]:
-            header += ["of other photographs: mean", "10th percentile"]
+            header += ["other photographs: mean", "their 10th percentile"]
             keys += ["others_mean", "others_low"]
         for (arm,), own in _common.grouped(results["builds"], "arm").items():
             parts = [[row[key] for row in own] for key in keys]

@@ -240,6 +240,10 @@ def test_lenses_as_built_that_are_no_operand(singlet, change, told):
     given = {"perturbation": np.zeros((2, width))} | change
     with pytest.raises(ValueError, match=told.replace("13", str(width))):
         design.spots_as_built(singlet[1], **given)
+    other, rays = drt_jax.load_lens("cooke_triplet"), None
+    operand = design.spots_as_built(singlet[1], np.zeros((1, width)))
+    with pytest.raises(ValueError, match="perturbed: a lens of 3 surfaces, the design has 8"):
+        operand(other, rays)
 
 
 @pytest.mark.parametrize("word", ["gradient", "second derivatives", "", 2, None])

@@ -246,6 +246,8 @@ def test_a_filter_in_front_of_the_network_and_the_best_stop(tmp_path):
         ("train.batch=3", "train.batch: expected a multiple of train.points"),
         ("arms=[frozen]", "arms: frozen needs spots"),
         ("arms=[]", "arms: expected one or more, or a map of noise and near_m"),
+        ("judge.others=nowhere", "judge.others: nowhere is not a folder; give one with images"),
+        ("judge.others={photos}", "judge.others: .*photos: expected four photographs or more"),
         ("map.noise=[0.1]", "map: needs taps above 0 and stops"),
         ("arms=[filter]", "arms: filter needs taps above 0"),
         ("arms=[freed]", "arms: freed needs taps above 0 and stops"),
@@ -260,6 +262,10 @@ def test_a_filter_in_front_of_the_network_and_the_best_stop(tmp_path):
     ],
 )
 def test_what_cannot_be_trained_is_refused_in_a_line(change, told, tmp_path, capsys):
+    (photos := tmp_path / "photos").mkdir()
+    for k in range(2):
+        Image.fromarray(np.full((40, 40, 3), 100 * k, np.uint8)).save(photos / f"{k}.png")
+    change = change.replace("{photos}", str(photos))
     own = [key for key in STARTS["joint"] if not key.startswith(("arms", "tolerances", "judge"))]
     with pytest.raises(SystemExit) as stopped:
         experiment = importlib.import_module("experiments.joint")
