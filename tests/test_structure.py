@@ -47,7 +47,7 @@ ALLOWED_ALL = {"learn.__init__", "show.layout", "show.analyses", "show.sheet", "
 ROOMS = {
     "drt_jax": 554,
     "drt_jax/check": 298,
-    "drt_jax/design": 2496,
+    "drt_jax/design": 2498,
     "drt_jax/files": 2928,
     "drt_jax/image": 3041,
     "drt_jax/learn": 656,
@@ -61,7 +61,7 @@ ROOMS = {
     "experiments/paper": 608,
     "experiments/runs": 453,
     "experiments/speed": 1443,
-    "experiments/together": 687,
+    "experiments/together": 691,
     "experiments/trust": 1992,
 }
 PUBLIC = 60

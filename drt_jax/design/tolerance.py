@@ -161,9 +161,10 @@ def spots_as_built(
         of others.
     perturbation: (K, P), deviations in units of their largest, such as `draw_perturbations(
         perturbed, 48, seed)`. Judge the design by others.
-    compensator: "none"; "focus": the sensor of each lens moves to its least spots, so that the
-        sensor of the design does not matter: give it a solve, or a light "spot" beside; or a
-        function of the design and of a lens as built, that returns this lens adjusted.
+    compensator: what is adjusted in each lens: "none"; "focus", the distance of its sensor; or a
+        function of the design and of a lens as built that returns the adjusted lens. With "focus"
+        the values do not depend on the sensor of the design: give that a solve, or add the operand
+        "spot" with a small weight.
     order: of the pupil rule of each lens.
     """
     adjust = compensator if callable(compensator) else None

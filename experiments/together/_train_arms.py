@@ -183,11 +183,10 @@ def _pictures(setup: Setup, imager: Callable, parameters: Any) -> dict[str, np.n
 def _photograph(
     setup: Setup, side: int, trained: dict[tuple[str, int], Any], rows: list[dict]
 ) -> dict[str, Any]:
-    """Part of a photograph through two lenses, that of the first arm and the best, and through
-    their networks. Lenses as built have the errors of that one which ends the worst tenth of the
-    first arm.
+    """Part of a photograph through the lens and network of the first arm, and of the best arm.
 
-    rows: of lenses as built, or of arms.
+    rows: of lenses as built, or of arms. Where they are of lenses as built, both lenses have the
+        same errors: those with which the first arm reaches its 10th percentile.
     """
     config, measure = setup.config, "low" if "low" in rows[0] else "psnr"
     groups = _common.grouped(rows, "arm").items()

@@ -110,7 +110,7 @@ class Judge:
 
 @dataclasses.dataclass(frozen=True)
 class Map:
-    """Scenes of a map of what the lenses in front of the training reach behind their best filter.
+    """Scenes for which finished lenses are compared behind their best filters, without training.
     noise: as of the experiment. near_m: nearest objects."""
 
     noise: Annotated[tuple[float, ...], within(1e-4, 10), different] = ()
@@ -136,7 +136,7 @@ class Config:
     taps: side of the filter in front of the network, pixels, odd; 0 for none.
     mtf_at: cycles/mm, of the arm `mtf`.
     arms: of the experiment's description; none if there is a `map`.
-    map: scenes in which no network is trained.
+    map: further scenes, for which least squares finish lenses, but no network is trained.
     seeds: starts of the network, with data and noise of their own.
     tolerances: of parts of the lens, for `tolerant` and judge.builds.
     refocus: True if the sensor of a lens as built follows its paraxial focus.
