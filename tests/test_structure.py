@@ -61,7 +61,7 @@ ROOMS = {
     "experiments/paper": 608,
     "experiments/runs": 453,
     "experiments/speed": 1443,
-    "experiments/together": 691,
+    "experiments/together": 721,
     "experiments/trust": 1992,
 }
 PUBLIC = 60

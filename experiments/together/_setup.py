@@ -4,7 +4,7 @@ import dataclasses
 import functools
 import math
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -217,14 +217,8 @@ class Setup:
     def _finish(self, name: str, lens: Lens) -> Array:
         """The vector of a lens that least squares have finished, see `finished`."""
         held = () if name == "freed" else self.config.held
-
-        def best(problem: design.Problem, steps: int = 100) -> Array:
-            start = problem.variables.vector(lens)
-            found = design.optimise(problem, start, steps)
-            return self.variables.vector(problem.variables.lens_of(found.vector))
-
         if name == "filter":
-            return best(self.filtered, _JACOBIANS)
+            return self._best(self.filtered, lens, _JACOBIANS)
         if name in ("spots", "mtf", "built"):
             aims: list[Any] = ["spot"]
             if name == "mtf":
@@ -233,13 +227,36 @@ class Setup:
                 some = design.draw_perturbations(self.built, _FEW, SEED + 2)
                 spots = design.spots_as_built(self.built, some, self._refocused, _COARSE)
                 aims = [design.Operand(spots)]
-            return best(self._problem(self._variables(lens, held), *aims))
-        stops = {s: self._variables(lens, held, s) for s in self.config.stops}
-        found = [best(self._problem(own, "spot")) for own in stops.values()]
+            return self._best(self._problem(self._variables(lens, held), *aims), lens)
+        found = [self._stopped(lens, held, stop) for stop in self.config.stops]
         reached = [self.filter_db(vector) for vector in found]
-        for stop, db in zip(stops, reached):
+        for stop, db in zip(self.config.stops, reached):
             print(f"stop {stop:g}: {db:.2f} dB behind the filter")
         return found[int(np.argmax(reached))]
+
+    def _best(self, problem: design.Problem, lens: Lens, steps: int = 100) -> Array:
+        """The vector of a lens that least squares have finished on a problem of it."""
+        found = design.optimise(problem, problem.variables.vector(lens), steps)
+        return self.variables.vector(problem.variables.lens_of(found.vector))
+
+    def _stopped(self, lens: Lens, held: tuple[str, ...], stop: float) -> Array:
+        """The vector of a lens finished on spots, with a factor of its entrance pupil."""
+        return self._best(self._problem(self._variables(lens, held, stop), "spot"), lens)
+
+    def plates(self, factors: Sequence[float]) -> list[dict[str, float]]:
+        """PSNR behind the best filter, for each stop: of the lens that least squares on spots
+        finish without the coefficients of its file, and of that with these times each factor."""
+        own, rows = self.lens_of(self.spoilt).coefficients, []
+        for stop in self.config.stops:
+            bare = dataclasses.replace(self.lens_of(self.spoilt), coefficients=0 * own)
+            lens = self.lens_of(self._stopped(bare, self.config.held, stop))
+            number = float(drt_jax.first_order(lens, math.inf, self.waves).f_number[1])
+            for factor in factors:
+                built = dataclasses.replace(lens, coefficients=factor * own)
+                db = self.filter_db(self.variables.vector(built))
+                rows.append({"f_number": number, "factor": factor, "db": db})
+            print(f"f/{number:.1f}: {np.round([row['db'] for row in rows[-len(factors) :]], 2)}")
+        return rows
 
     @functools.cached_property
     def rates(self) -> Array:

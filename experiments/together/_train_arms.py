@@ -38,6 +38,8 @@ def run(config: Any, run: Run) -> dict[str, Any]:
     others = _others(config.judge.others, side, run)
     setup = Setup(config, _training.read_patches(config.data, side, 0, run.folder))
     about = _common.settings(config, "name", "field_deg") | {"map": _map(setup, run)}
+    plates = config.map.plates
+    about |= {"plates": run.once("plates", lambda: setup.plates(plates)) if plates else []}
     if not config.arms:
         return about | {"rows": []}
     begins = {"spoilt": None} | {ARMS[arm].begins: None for arm in ARMS if arm in config.arms}

@@ -111,10 +111,12 @@ class Judge:
 @dataclasses.dataclass(frozen=True)
 class Map:
     """Scenes for which finished lenses are compared behind their best filters, without training.
-    noise: as of the experiment. near_m: nearest objects."""
+    noise: as of the experiment. near_m: nearest objects. plates: at each of `stops`, factors of the
+        coefficients in the lens's file, such as those of a cubic plate; they must be `held`."""
 
     noise: Annotated[tuple[float, ...], within(1e-4, 10), different] = ()
     near_m: Annotated[tuple[float, ...], within(1e-3, math.inf), different] = ()
+    plates: Annotated[tuple[float, ...], within(-1e3, 1e3), different] = ()
 
 
 @dataclasses.dataclass(frozen=True)
@@ -190,10 +192,13 @@ class Config:
         solved = not self.stops or "entrance_pupil" in {solve.kind for solve in self.solves}
         _common.require(solved, "stops: needs the solve entrance_pupil")
         _common.require(self.taps % 2 or not self.taps, "taps: expected an odd number, or 0")
-        mapped = not (self.map.noise or self.map.near_m) or (self.taps and self.stops)
+        asked = self.map.noise or self.map.near_m or self.map.plates
+        mapped = not asked or (self.taps and self.stops)
         _common.require(bool(mapped), "map: needs taps above 0 and stops")
-        some = self.arms or (self.map.noise and self.map.near_m)
-        _common.require(bool(some), "arms: expected one or more, or a map of noise and near_m")
+        some = self.arms or (self.map.noise and self.map.near_m) or self.map.plates
+        _common.require(bool(some), "arms: expected one or more, or a map")
+        held = not self.map.plates or "coefficients" in self.held
+        _common.require(held, "map.plates: needs coefficients among variables and held")
         builds = self.judge.builds or any(ARMS[arm].as_built for arm in self.arms)
         missing = "tolerances: needs at least one item for lenses as built"
         _common.require(bool(self.tolerances) or not builds, missing)
@@ -204,6 +209,12 @@ def tables(results: dict[str, Any]) -> dict[str, str]:
     name, found = results["name"], {}
     if results.get("map"):  # older runs have no key
         found[f"joint, {name}: map"] = _map_table(results["map"])
+    if results.get("plates"):
+        groups = _common.grouped(results["plates"], "f_number")
+        cells = {n: [f"{row['db']:.2f}" for row in own] for (n,), own in groups.items()}
+        lines = [[f"f/{number:.1f}", *own] for number, own in cells.items()]
+        header = ["stop", *(f"{row['factor']:g}" for row in next(iter(groups.values())))]
+        found[f"joint, {name}: plates"] = _common.table(header, lines)
     if not results["rows"]:
         return found
     header = ["arm", "seeds", "MAE", "RMSE", "PSNR dB", "SSIM"]
@@ -278,6 +289,12 @@ def draw(results: dict[str, Any], figures: pathlib.Path) -> None:
                 ax.minorticks_off()
                 ax.set_title(f"{near:g} m to infinity" if near else "far objects")
                 _plots.label_axes(ax, "noise", "PSNR behind the best filter (dB)")
+    if results.get("plates"):
+        with _plots.picture(figures / "plates.png", 5.5, 4) as (ax,):
+            for (number,), own in _common.grouped(results["plates"], "f_number").items():
+                factors, db = zip(*((row["factor"], row["db"]) for row in own))
+                ax.plot(factors, db, "o-", label=f"f/{number:.1f}")
+            _plots.label_axes(ax, "strength of the plate", "PSNR behind the best filter (dB)")
     if not results["rows"]:
         return
     seconds = {row["arm"]: row["step_s"] for row in results["rows"]}  # of the last seed
