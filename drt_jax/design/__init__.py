@@ -1,5 +1,11 @@
 """Designing a lens: variables, operands, least squares, many starts, tolerances."""
 
+from ..lens.insert import (
+    inserted as inserted,
+    removed as removed,
+    with_asphere as with_asphere,
+    with_stop as with_stop,
+)
 from . import least_squares as least_squares
 from .compensation import AsBuilt as AsBuilt, as_built as as_built
 from .field_rays import FieldRays as FieldRays
@@ -9,6 +15,7 @@ from .glasses import (
     snap_glasses as snap_glasses,
 )
 from .growth import Growth as Growth, grow as grow, part_of as part_of
+from .insertions import Insertion as Insertion, insertions as insertions
 from .least_squares import Evaluation as Evaluation, Search as Search
 from .limits import Limit as Limit
 from .media import elements_of as elements_of

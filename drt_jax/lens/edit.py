@@ -83,14 +83,15 @@ def scaled(lens: Lens, factor: Numbers) -> Lens:
 
 
 def reindexed(lens: Lens, rows: Sequence[int], media: Sequence[int], thickness: Array) -> Lens:
-    """The lens with its surfaces in another order, or with planes added.
+    """The lens with its surfaces in another order, with planes added, or with fewer surfaces.
 
     Here every field of `Lens` that has rows for surfaces or media, or numbers of surfaces, is
     mapped.
 
     lens: the lens.
     rows: (T + 1,), for each of the T new surfaces and the sensor the old row; -1 for a new plane
-        without an aperture. Every old row occurs once.
+        without an aperture. No old row occurs twice; the stop, and the ends and pivots of elements,
+        occur.
     media: (T + 1,), for each new medium the old one.
     thickness: (T - 1,), between the new vertices, mm.
     """
@@ -99,6 +100,9 @@ def reindexed(lens: Lens, rows: Sequence[int], media: Sequence[int], thickness: 
 
     def numbers(surfaces: Iterable[int]) -> tuple[int, ...]:
         return tuple(new[i] for i in surfaces)
+
+    def stay(surfaces: Sequence[int]) -> list[int]:
+        return [k for k, i in enumerate(surfaces) if i in new]
 
     def taken(array: Array | None, plane: float = 0.0) -> Any:
         if array is None:
@@ -109,14 +113,15 @@ def reindexed(lens: Lens, rows: Sequence[int], media: Sequence[int], thickness: 
     phase, elements, apertures = lens.phase, lens.elements, lens.apertures
     replace = dataclasses.replace
     if phase is not None:
-        surfaces = numbers(phase.surfaces)
-        order = np.argsort(surfaces)
-        phase = Phase(
-            phase.coefficients[order],
-            phase.order[order],
-            tuple(sorted(surfaces)),
-            tuple(phase.forms[k] for k in order),
-        )
+        ruled = phase.surfaces
+        order = sorted(stay(ruled), key=lambda k: new[ruled[k]])
+        rows_of_phase, surfaces = np.array(order, int), numbers(ruled[k] for k in order)
+        own = phase.coefficients[rows_of_phase], phase.order[rows_of_phase]
+        phase = Phase(*own, surfaces, tuple(phase.forms[k] for k in order)) if order else None
+    if apertures is not None:
+        left = stay(apertures.surfaces)
+        apertures = apertures.only(left) if left else None
+        apertures = apertures and replace(apertures, surfaces=numbers(apertures.surfaces))
     if elements is not None:
         spans = tuple((new[first], new[last]) for first, last in elements.spans)
         elements = replace(elements, spans=spans, about=numbers(elements.about))
@@ -130,12 +135,12 @@ def reindexed(lens: Lens, rows: Sequence[int], media: Sequence[int], thickness: 
         tilt=taken(lens.tilt),
         phase=phase,
         elements=elements,
-        apertures=apertures and replace(apertures, surfaces=numbers(apertures.surfaces)),
+        apertures=apertures,
         stop=new[lens.stop],
         labels=Labels(lens.name, tuple(lens.glasses[i] for i in media)),
         forms=tuple(lens.forms[i] if i >= 0 else "asphere" for i in rows),
         mirrors=tuple(i >= 0 and lens.mirrors[i] for i in rows[:-1]),
-        curved=tuple(sorted(numbers(lens.curved))),
+        curved=tuple(sorted(numbers(i for i in lens.curved if i in new))),
     )
 
 

@@ -276,7 +276,7 @@ def finished(config: Config, problem: design.Problem, found: dict[str, Any]) -> 
     history = np.concatenate([part.history for part in parts])
     first = parts[0].history
     history[len(first) :, 2] += first[-1, 2]  # Jacobians count on
-    end, glasses = _snapped(config, problem, parts[-1])
+    end, glasses = snapped(config, problem, parts[-1])
     return {
         "vector": end.vector.tolist(),
         "merit_end": end.merit,
@@ -289,7 +289,7 @@ def finished(config: Config, problem: design.Problem, found: dict[str, Any]) -> 
     }
 
 
-def _snapped(
+def snapped(
     config: Config, problem: design.Problem, found: design.Optimum
 ) -> tuple[design.Optimum, dict[str, Any]]:
     """The optimum, with real glasses if these are wanted, and what each of them has cost."""

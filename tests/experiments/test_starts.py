@@ -47,6 +47,12 @@ STARTS = {
         *("limit=64", "rounds=2", "peers=[64]", "frequencies=5", "photo_pixels=48", "repeats=1"),
         *("gallery.lens=singlet", "gallery.fields_deg=[0]", "gallery.distances_m=[.inf]"),
     ],
+    "elements": [
+        *("elements=1", "design.fields_deg=[0,5]", "design.wavelengths_um=[0.588]"),
+        *("design.variables=[{kind: curvature}, {kind: sensor}]", "design.order=3"),
+        *("design.operands=[{kind: spot}, {kind: focal_length, low: 50, high: 50.01}]",),
+        *("design.glasses={makers: []}", "design.trials=10"),
+    ],
     "joint": [
         *(
             "lens=singlet",
@@ -63,7 +69,7 @@ STARTS = {
     ],
 }
 # Programs of many kinds.
-LONG = ("benchmark", "faults", "files", "images", "joint", "skips", "stability")
+LONG = ("benchmark", "elements", "faults", "files", "images", "joint", "skips", "stability")
 # Those that tests of their own start, in `test_NAME`.
 ELSEWHERE = ("accuracy", "design", "render", "tolerance")
 
@@ -158,6 +164,14 @@ def checked_images(results):
     assert errors["gaussian"] is None and errors["rays"] < 0.1 and errors["waves"] < 0.02
     assert {row["note"] for row in results["peers"]} == {"no program of this kind"}
     assert np.max(results["views"][0]["transfer"]) <= 1 + 1e-9
+
+
+def checked_elements(results):
+    """Both sides of two surfaces, and the best lens with a smaller spot than the singlet."""
+    first, *others, last = results["rows"]
+    assert first["elements"] == 1 and {row["elements"] for row in (*others, last)} == {2}
+    assert 1 <= len(others) <= 4 and others[0]["merit"] < 0.5 * first["merit"]
+    assert last["merit"] <= 1.001 * others[0]["merit"]
 
 
 def checked_joint(results):
