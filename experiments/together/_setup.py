@@ -4,7 +4,7 @@ import dataclasses
 import functools
 import math
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -228,7 +228,7 @@ class Setup:
                 spots = design.spots_as_built(self.built, some, self._refocused, _COARSE)
                 aims = [design.Operand(spots)]
             return self._best(self._problem(self._variables(lens, held), *aims), lens)
-        found = [self._stopped(lens, held, stop) for stop in self.config.stops]
+        found = [self.stopped(lens, held, stop) for stop in self.config.stops]
         reached = [self.filter_db(vector) for vector in found]
         for stop, db in zip(self.config.stops, reached):
             print(f"stop {stop:g}: {db:.2f} dB behind the filter")
@@ -239,24 +239,9 @@ class Setup:
         found = design.optimise(problem, problem.variables.vector(lens), steps)
         return self.variables.vector(problem.variables.lens_of(found.vector))
 
-    def _stopped(self, lens: Lens, held: tuple[str, ...], stop: float) -> Array:
+    def stopped(self, lens: Lens, held: tuple[str, ...], stop: float) -> Array:
         """The vector of a lens finished on spots, with a factor of its entrance pupil."""
         return self._best(self._problem(self._variables(lens, held, stop), "spot"), lens)
-
-    def plates(self, factors: Sequence[float]) -> list[dict[str, float]]:
-        """PSNR behind the best filter, for each stop: of the lens that least squares on spots
-        finish without the coefficients of its file, and of that with these times each factor."""
-        own, rows = self.lens_of(self.spoilt).coefficients, []
-        for stop in self.config.stops:
-            bare = dataclasses.replace(self.lens_of(self.spoilt), coefficients=0 * own)
-            lens = self.lens_of(self._stopped(bare, self.config.held, stop))
-            number = float(drt_jax.first_order(lens, math.inf, self.waves).f_number[1])
-            for factor in factors:
-                built = dataclasses.replace(lens, coefficients=factor * own)
-                db = self.filter_db(self.variables.vector(built))
-                rows.append({"f_number": number, "factor": factor, "db": db})
-            print(f"f/{number:.1f}: {np.round([row['db'] for row in rows[-len(factors) :]], 2)}")
-        return rows
 
     @functools.cached_property
     def rates(self) -> Array:

@@ -4,7 +4,7 @@ import dataclasses
 import itertools
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any
 
@@ -39,7 +39,7 @@ def run(config: Any, run: Run) -> dict[str, Any]:
     setup = Setup(config, _training.read_patches(config.data, side, 0, run.folder))
     about = _common.settings(config, "name", "field_deg") | {"map": _map(setup, run)}
     plates = config.map.plates
-    about |= {"plates": run.once("plates", lambda: setup.plates(plates)) if plates else []}
+    about |= {"plates": run.once("plates", lambda: _plates(setup, plates)) if plates else []}
     if not config.arms:
         return about | {"rows": []}
     begins = {"spoilt": None} | {ARMS[arm].begins: None for arm in ARMS if arm in config.arms}
@@ -108,6 +108,22 @@ def _map(setup: Setup, run: Run) -> list[dict[str, Any]]:
         lenses = run.once(f"map {what}", measured)
         nearest = near if math.isfinite(near) else None
         rows.append({"near_m": nearest, "noise": noise, "lenses": lenses})
+    return rows
+
+
+def _plates(setup: Setup, factors: Sequence[float]) -> list[dict[str, float]]:
+    """PSNR behind the best filter, for each stop: of the lens that least squares on spots finish
+    without the coefficients of its file, and of that with these times each factor."""
+    spoilt, rows = setup.lens_of(setup.spoilt), []
+    bare = dataclasses.replace(spoilt, coefficients=0 * spoilt.coefficients)
+    for stop in setup.config.stops:
+        lens = setup.lens_of(setup.stopped(bare, setup.config.held, stop))
+        number = float(drt_jax.first_order(lens, math.inf, setup.waves).f_number[1])
+        for factor in factors:
+            built = dataclasses.replace(lens, coefficients=factor * spoilt.coefficients)
+            db = setup.filter_db(setup.variables.vector(built))
+            rows.append({"f_number": number, "factor": factor, "db": db})
+        print(f"f/{number:.1f}: {np.round([row['db'] for row in rows[-len(factors) :]], 2)}")
     return rows
 
 
