@@ -148,11 +148,13 @@ def field_rows(
     middle, symmetry = scene.reference(None), symmetry_of(lens, scene.field)
     whole = not any(beam.clips for beam in beams)
     for field, point, beam in zip(fields, scene.each(), beams):
-        rough, found = (_moments(lens, point, _rule(lens, n, symmetry, whole)) for n in _ORDERS)
-        light = 100 * float(found.throughput[middle])
-        if not light > 0:
-            yield f"{field:.4g}", f"! {_why_dark(lens, point, Gauss(8, symmetry))}"
+        try:
+            rules = (_rule(lens, order, symmetry, whole) for order in _ORDERS)
+            rough, found = (psf_moments(lens, point, rule) for rule in rules)
+        except ValueError as error:  # no light arrives in one of the wavelengths
+            yield f"{field:.4g}", f"! {error}"
             continue
+        light = 100 * float(found.throughput[middle])
         cut = "; ".join(filter(None, (", ".join(map(str, beam.clipping)), *beam.ends))) or "none"
         squares = [np.trace(np.asarray(m.covariance), axis1=1, axis2=2) for m in (found, rough)]
         sizes = [f"{1e3 * s:.4g}" if s > _NO_SIZE else "<1e-6" for s in np.sqrt(squares[0])]
@@ -173,17 +175,7 @@ def field_rows(
             yield f"  ! on the axis {share} does not arrive; surfaces that clip: {cut}"
 
 
-_moments = jit(lambda lens, scene, rule: psf_moments(lens, scene, rule), ONCE)
 _first_order = jit(first_order, ONCE)
-
-
-def _why_dark(lens: Lens, scene: Scene, rule: PupilRule) -> str:
-    """The reason why no light of a scene arrives."""
-    try:
-        psf_moments(lens, scene, rule)
-    except ValueError as error:
-        return str(error)
-    return "no light arrives"
 
 
 def _rule(lens: Lens, order: int, symmetry: Symmetry, whole: bool) -> PupilRule:

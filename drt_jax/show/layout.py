@@ -120,9 +120,9 @@ class _Traced(NamedTuple):
     clips: np.ndarray
 
 
-def _rays(lens: Lens, scene: Scene, pupil: jax.Array) -> tuple[jax.Array, ...]:
-    rays = trace_rays(lens, scene, pupil)
-    points, directions = rays.points[0], rays.directions[0, :, -1]
+def _in_own_axes(lens: Lens, points: jax.Array, directions: jax.Array) -> tuple[jax.Array, ...]:
+    """Hits, directions and clips of `_Traced`, of points and directions along the axes of the
+    lens."""
     vertex, across, turned = lens.places
     across = jnp.zeros((len(vertex), 2), vertex.dtype) if across is None else across
     own = points - jnp.concatenate([across, vertex[:, None]], axis=1)[None]
@@ -131,16 +131,19 @@ def _rays(lens: Lens, scene: Scene, pupil: jax.Array) -> tuple[jax.Array, ...]:
         directions = directions @ turned[-1]
     hits = own[..., :2]
     clips = clipping_surface(lens, (hits[..., 0].T, hits[..., 1].T))
-    return points, hits, directions, rays.status[0], clips
+    return hits, directions, clips
 
 
-_trace = jit(_rays, ONCE)
+_own = jit(_in_own_axes, ONCE)
 
 
 def _traced(lens: Lens, scene: Scene, pupil: np.ndarray) -> _Traced:
     """Rays of one wavelength through points (Q, 2) of the stop, in units of its radius."""
     filled = np.resize(pupil, (-(-len(pupil) // _RAYS) * _RAYS, 2))
-    found = _trace(lens, scene, jnp.asarray(filled, lens.curvature.dtype))
+    rays = trace_rays(lens, scene, jnp.asarray(filled, lens.curvature.dtype))
+    points = rays.points[0]
+    hits, directions, clips = _own(lens, points, rays.directions[0, :, -1])
+    found = points, hits, directions, rays.status[0], clips
     return _Traced(*(np.asarray(a)[: len(pupil)] for a in found))
 
 

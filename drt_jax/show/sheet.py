@@ -12,11 +12,12 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from ..compilation import ONCE, jit
-from ..image.beam import beam_rule, trace_beam
+from ..image.beam import beam_rule
 from ..image.chief import distortion, field_curvature, lateral_colour
 from ..image.encircled import encircled
 from ..image.fans import RayFans, ray_fans
 from ..image.spots import Spots, rule_for, spot_diagram
+from ..image.refined import beams_of
 from ..image.transfer import Model, transfer_of
 from ..lens.lens import Lens
 from ..lens.scene import Scene, checked_scene, over_points
@@ -122,19 +123,20 @@ def _analysed(
     foci = field_curvature(lens, curve)
     bent, colour = distortion(lens, curve), lateral_colour(lens, curve)
     say("tracing fans")
-    fans = _fans(lens, at(some))
+    fans = ray_fans(lens, at(some), _FAN)
     say("tracing spots")
     # The axis, the fields of the spots, and the fields of the illumination curve.
     wide = np.array([0.0, *some, *line[:: _CURVE // _LIGHT]])
     rule = rule_for(lens, at(wide), sampling, _ORDER)
-    spots = _spots(lens, at(wide), rule)
+    spots = spot_diagram(lens, at(wide), rule)
     spots, fans = jax.tree.map(np.asarray, (spots, fans))
     say("tracing waves")
     limit = 2e3 * np.sqrt(spots.solid_angle[0, middle] / np.pi) / waves[middle]
     lines = np.linspace(0, min(limit, _LINES) if limit > 0 else _LINES, _CURVE)
     radii, model, cells = _circles(spots, len(some))
     picked = checked_scene(lens, at(some))
-    contrast, best, energy = _waves(lens, picked, jnp.asarray(lines), radii, rule, model, cells)
+    beams = beams_of(lens, picked, beam_rule(_DEGREE, rule.symmetry, rule))
+    contrast, best, energy = _waves(lens, beams, picked.wavelengths, jnp.asarray(lines), radii, model, cells)
     say("drawing")
 
     def draw_on(axes: dict[str, Any]) -> None:
@@ -186,31 +188,26 @@ def _draw_fields(
         analyses.legend(axes[panel][-1])
 
 
-_fans = jit(functools.partial(ray_fans, count=_FAN), ONCE)
-_spots = jit(spot_diagram, ONCE)
-
 
 @functools.partial(jit, wanted=ONCE, static_argnames=("model", "cells"))
 def _waves(
     lens: Lens,
-    scene: Scene,
+    beams,
+    waves,
     lines: Array,
     radii: Array,
-    rule: PupilRule,
     model: Model,
     cells: int,
 ) -> tuple[Array, Array, Array]:
     """MTF (F, 2, N), its limit (N,) at the first field, and encircled energy (F, N)."""
-    made, waves = beam_rule(_DEGREE, rule.symmetry, rule), scene.wavelengths
     spectrum = jnp.ones_like(waves)
 
-    def one(point: Scene) -> tuple[Array, Array, Array]:
-        beam = trace_beam(lens, point, made)
+    def one(beam):
         given = lens, beam, waves
         otf, limit = transfer_of(*given, lines, spectrum, "waves", _CELLS)
         return jnp.abs(otf), limit[0], encircled(*given, radii, spectrum, model, cells)
 
-    contrast, limit, energy = over_points(one, scene)
+    contrast, limit, energy = jax.lax.map(one, beams)
     return contrast, limit[0], energy
 
 
