@@ -23,7 +23,7 @@ from ..numerics import einsum
 from ..pupil.patterns import hexapolar
 from ..rays.rays import trace_rays
 from ..rays.status import Status
-from .figures import FIELD_COLOURS
+from .figures import FIELD_COLOURS, scale_bar
 
 _POINTS = 161
 _RAYS = 600  # rays per trace, so that all traces share one compiled program
@@ -50,6 +50,7 @@ class Drawing(NamedTuple):
         of a vignetted beam, the rays at its edges.
     vignetted: clipped rays of the fans, up to the surface that clips them.
     fields: the angles of the fields, radians.
+    numbers: the number of each surface that bends light, and the top (z, y) of its outline.
     """
 
     glass: list[np.ndarray]
@@ -59,6 +60,7 @@ class Drawing(NamedTuple):
     rays: list[list[np.ndarray]]
     vignetted: list[np.ndarray]
     fields: Sequence[float] = ()
+    numbers: Sequence[tuple[int, np.ndarray]] = ()
 
 
 def draw(lens: Lens, scene: Scene | None = None, rays: int = 7) -> Drawing:
@@ -70,7 +72,7 @@ def draw(lens: Lens, scene: Scene | None = None, rays: int = 7) -> Drawing:
     """
     scene = checked_scene(lens, Scene.point() if scene is None else scene)
     middle = slice(scene.reference(None), scene.reference(None) + 1)
-    points = dataclasses.replace(scene, wavelengths=scene.wavelengths[middle]).each()
+    points = _in_colour(scene, scene.wavelengths[middle]).each()
     angles = [float(point.field[1]) for point in points]
     # A surface that does not bend light is neither a corner of a ray nor a face of glass.
     corners = [*lens.active, lens.count]
@@ -91,9 +93,10 @@ def draw(lens: Lens, scene: Scene | None = None, rays: int = 7) -> Drawing:
         for angle, point, hit in zip(angles, points, hits, strict=True)
     ]
     vignetted = [_path(ray, start, *place) for ray, *place in ends]
-    profiles = np.linspace(*_extents(lens, 1.1 * _widths(lens, hits, reach)), _POINTS, axis=-1)
+    extents = _extents(lens, 1.1 * _widths(lens, hits, reach))
+    profiles = np.linspace(*extents, _POINTS, axis=-1)
     faces = [_placed(lens, i, y, sag(lens, i, 0.0, y)) for i, y in enumerate(profiles)]
-    glass = [np.concatenate([faces[i], faces[j][::-1], faces[i][:1]]) for i, j in _pieces(lens)]
+    glass = [_outline(lens, pair, profiles, faces) for pair in _pieces(lens)]
     pierced = _pierced(lens, profiles)
     mirrors = [
         np.where(pierced[i, :, None], np.nan, faces[i]) for i in np.flatnonzero(lens.mirrors)
@@ -102,7 +105,34 @@ def draw(lens: Lens, scene: Scene | None = None, rays: int = 7) -> Drawing:
     outwards = (high - low) / np.linalg.norm(high - low) * 0.15 * reach
     blades = [np.stack([low, low - outwards]), np.stack([high, high + outwards])]
     sensor = _sensor(lens, paths, reach)
-    return Drawing(glass, mirrors, blades, sensor, paths, vignetted, angles)
+    numbers = [(i, faces[i][-1]) for i in lens.active]
+    return Drawing(glass, mirrors, blades, sensor, paths, vignetted, angles, numbers)
+
+
+def _outline(
+    lens: Lens, pair: tuple[int, int], profiles: np.ndarray, faces: list[np.ndarray]
+) -> np.ndarray:
+    """The closed outline of a piece of glass with one rim, as it is made: the narrower face is
+    continued by a plane; or, where the faces would then cross, with the rims of its own faces.
+
+    profiles: (S, N), mm, heights of the points of the faces.
+    """
+    low, high = profiles[list(pair), 0].min(), profiles[list(pair), -1].max()
+    wide = [np.concatenate([low[None], profiles[i], high[None]]) for i in pair]
+    made = [
+        _placed(lens, i, y, sag(lens, i, 0.0, np.clip(y, *profiles[i][[0, -1]])))
+        for i, y in zip(pair, wide)
+    ]
+    gaps = [made[1][end, 0] - made[0][end, 0] for end in (0, -1)]
+    inside = faces[pair[1]][_POINTS // 2, 0] - faces[pair[0]][_POINTS // 2, 0]
+    front, back = made if np.all(np.array(gaps) * inside > 0) else (faces[i] for i in pair)
+    return np.concatenate([front, back[::-1], front[:1]])
+
+
+def _in_colour(scene: Scene, wavelengths: ArrayLike) -> Scene:
+    """A scene in one wavelength, (1,) um."""
+    one = jnp.asarray(wavelengths)
+    return dataclasses.replace(scene, wavelengths=one, wavelength_weights=None)
 
 
 class _Traced(NamedTuple):
@@ -198,7 +228,7 @@ def beam_of(lens: Lens, scene: Scene) -> Beam:
     scene, middle = checked_scene(lens, scene), scene.reference(None)
     if len(scene.wavelengths) > 1:
         waves = jnp.roll(scene.wavelengths, -middle)[:, None]
-        own, *more = (beam_of(lens, dataclasses.replace(scene, wavelengths=w)) for w in waves)
+        own, *more = (beam_of(lens, _in_colour(scene, w)) for w in waves)
         for each in more:
             own = own._replace(
                 clipping=sorted({*own.clipping, *each.clipping}),
@@ -223,6 +253,25 @@ def beam_of(lens: Lens, scene: Scene) -> Beam:
     shift = -np.mean(np.sum(hits * slopes, axis=1)) / growth if growth > 0 else 0.0
     best = math.sqrt(max(size - growth * shift**2, 0.0))
     return Beam(clipping, ends, obscured, wide, math.sqrt(size), best, float(shift))
+
+
+def even_hits(lens: Lens, scene: Scene) -> np.ndarray:
+    """Hits (W, Q, 2) on the sensor, mm, of rays evenly over the stop from one object point, so that
+    their density is that of the light; inf for a ray that does not arrive."""
+    scene = checked_scene(lens, scene)
+    waves = np.asarray(scene.wavelengths)[:, None]
+    colours = [_in_colour(scene, jnp.asarray(wave)) for wave in waves]
+    return np.stack([beam_hits(lens, colour)[:, -1] for colour in colours])
+
+
+def beam_hits(lens: Lens, scene: Scene) -> np.ndarray:
+    """Hits (Q, S + 1, 2) on all surfaces and the sensor, mm from their vertices, of rays evenly
+    over the stop from one object point, in the middle wavelength; inf for those that do not arrive.
+    """
+    scene, middle = checked_scene(lens, scene), scene.reference(None)
+    wave = scene.wavelengths[middle : middle + 1]
+    found = _traced(lens, _in_colour(scene, wave), hexapolar(_RINGS)[0])
+    return np.where((found.status == Status.OK)[:, None, None], found.hits, np.inf)
 
 
 def _obscured(lens: Lens, hits: np.ndarray) -> bool:
@@ -300,9 +349,18 @@ def lens_drawing(axes: Axes, drawing: Drawing) -> Axes:
     for blade in drawing.stop:
         axes.plot(*blade.T, color="black", linewidth=2.5, solid_capstyle="butt", zorder=3)
     axes.plot(*drawing.sensor.T, color="black", linewidth=1.5)
+    for number, (z, y) in drawing.numbers:
+        axes.annotate(
+            str(number),
+            (z, y),
+            (0, 2 + 6 * (number % 2)),
+            textcoords="offset points",
+            ha="center",
+            fontsize=6,
+        )
     axes.set_aspect("equal")
     axes.set(xlabel="z from the first vertex (mm)", ylabel="y (mm)")
-    return axes
+    return scale_bar(axes, "mm")
 
 
 def _placed(lens: Lens, i: int, y: np.ndarray, z: ArrayLike) -> np.ndarray:
