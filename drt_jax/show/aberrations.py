@@ -78,7 +78,7 @@ def footprints(axes: Axes, hits: ArrayLike, semi_diameter: float) -> Axes:
         axes.plot(*points[good].T, ".", color=hue, markersize=1)
     if np.isfinite(semi_diameter):
         axes.add_patch(Circle((0, 0), semi_diameter, fill=False, color="black", linewidth=0.8))
-    axes.set_aspect("equal")
+    axes.set_aspect("equal", adjustable="datalim")
     axes.autoscale_view()
     return axes
 

@@ -1,6 +1,7 @@
 """Further analyses of a lens, which take longer to compile than those of a sheet."""
 
 import dataclasses
+import warnings
 from collections.abc import Callable, Iterator
 
 import numpy as np
@@ -155,7 +156,7 @@ def _maps(lens: Lens, scene: Scene) -> Iterator[tuple[str, Figure]]:
     found = wavefront(lens, one, points[inside])
     opd = np.where(np.asarray(found.status) == Status.OK, np.asarray(found.opd), np.nan)[:, 0]
     names = _names(scene)
-    figure, axes = new(1, len(names), 2.6, 2.4)
+    figure, axes = new(1, len(names), 3.4, 2.7)
     for own, values, name in zip(np.ravel(axes), opd, names):
         grid = np.full(inside.shape, np.nan)
         grid[inside] = values
@@ -173,11 +174,17 @@ def _psf(lens: Lens, scene: Scene, rule: PupilRule) -> Iterator[tuple[str, Figur
     kind: Model = "waves" if reach < _WIDEST * airy else "rays"
     pixel = 2.2 * reach / _PIXELS
     sampling = Sampling.of(kind, rule, _CELLS if kind == "rays" else 2 * _CELLS)
-    spread = psf(lens, scene, pixel, _PIXELS, sampling=sampling)
-    share = np.asarray(scene.spectrum * spread.throughput)[..., None, None]
+    with warnings.catch_warnings():  # the labels say how much light falls outside
+        warnings.simplefilter("ignore")
+        spread = psf(lens, scene, pixel, _PIXELS, sampling=sampling)
+    share = np.asarray(scene.spectrum) * np.asarray(spread.throughput)
+    share = share[..., None, None]
     kernel = np.sum(share * np.asarray(spread.kernel), axis=1)
+    total = np.maximum(np.sum(share[..., 0, 0], axis=1), np.finfo(float).tiny)
+    outside = 100 * np.sum(share[..., 0, 0] * np.asarray(spread.outside), axis=1) / total
     names = _names(scene)
     figure, axes = new(1, len(names), 2.6, 2.6)
-    for own, light, name in zip(np.ravel(axes), kernel, names):
-        aberrations.point_spread(own, light, pixel).set_title(name, fontsize=8)
+    for own, light, name, part in zip(np.ravel(axes), kernel, names, outside):
+        aberrations.point_spread(own, light, pixel)
+        own.set_title(f"{name}, {part:.2g} % outside", fontsize=8)
     yield f"Point spread function, by {kind}, of its peak", figure

@@ -6,6 +6,7 @@ import io
 import pathlib
 from collections.abc import Sequence
 
+import matplotlib
 from matplotlib.figure import Figure
 
 # Rows of a table, the header first; text; a figure; or the file of a PNG picture.
@@ -13,7 +14,7 @@ Part = Sequence[Sequence[str]] | str | Figure | pathlib.Path
 # Vector graphics above this size, in characters, are drawn as pixels instead.
 _LARGEST = 150_000
 # Widest figure, inches, that stands in one of two columns.
-_COLUMN = 6.0
+_COLUMN = 6.5
 _STYLE = """
 :root { color-scheme: light dark; font: 16px/1.5 system-ui, sans-serif }
 body { max-width: 90rem; margin: 0 auto; padding: 1rem }
@@ -22,7 +23,7 @@ main { display: grid; gap: 0 2rem; grid-template-columns: minmax(0, 1fr) }
 @media (min-width: 60rem) {
   main { grid-template-columns: repeat(2, minmax(0, 1fr)) } .both { grid-column: 1 / -1 }
 }
-figure { margin: 0; background: white; overflow-x: auto }
+figure { margin: 0; background: white; overflow-x: auto; color: black }
 figure :is(img, svg) { width: 100%; height: auto } .both figure :is(img, svg) { min-width: 40rem }
 .wide { overflow-x: auto } pre { overflow-x: auto; font-size: .85rem }
 table { border-collapse: collapse; font-variant-numeric: tabular-nums }
@@ -35,7 +36,7 @@ def page(title: str, parts: Sequence[tuple[str, Part]]) -> str:
     """A page of HTML that needs no other file.
 
     parts: headings, each with rows of a table, text, a Markdown table, a figure or a PNG file. On a
-        wide window, figures of at most 6 inches stand in two columns.
+        wide window, figures of at most 6.5 inches stand in two columns.
     """
     body = [f"<h1>{html.escape(title)}</h1><main>"]
     for heading, part in parts:
@@ -77,7 +78,8 @@ def _table(rows: Sequence[Sequence[str]]) -> str:
 def _drawn(figure: Figure) -> str:
     """A figure as vector graphics, or as pixels if these are smaller."""
     written = io.StringIO()
-    figure.savefig(written, format="svg", metadata={"Date": None})
+    with matplotlib.rc_context({"svg.fonttype": "none"}):  # text as text, a third of the size
+        figure.savefig(written, format="svg", metadata={"Date": None})
     text = written.getvalue()
     if len(text) <= _LARGEST:
         return text[text.index("<svg") :]
