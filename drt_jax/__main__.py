@@ -319,7 +319,7 @@ def run_show(options: argparse.Namespace) -> None:
         if web:
             rows = [row for row in table if not isinstance(row, str)]
             lines = [line for line in (*notes, *table) if isinstance(line, str) and line]
-            parts: list[tuple[str, Part]] = [("First-order data", first), ("Spots", rows)]
+            parts: list[tuple[str, Part]] = [("First-order data", first), ("Spots and light", rows)]
             parts += [("Warnings", "\n".join(lines))] if lines else []
             used = np.max([beam.wide for beam in beams], axis=0)[:-1]
             parts += [*prescription(lens, used).items(), *panels(*view).items()]

@@ -29,6 +29,7 @@ _POINTS = 161
 _RAYS = 600  # rays per trace, so that all traces share one compiled program
 _RINGS, _RIM = 10, 240  # rings of rays that fill the stop, and number of rays on its rim
 _SCANS = 3  # scans of the meridian for the edges of a beam; each refines the last one
+_ON_RIM = 1e-6  # mm: a ray that misses an aperture by less only grazes it
 # Words for rays that do not reach the sensor, other than those clipped by an aperture.
 ENDS = {
     Status.MISSED: "some miss",
@@ -281,7 +282,7 @@ def _obscured(lens: Lens, hits: np.ndarray) -> bool:
         return False
     edges = clearance(lens, (jnp.asarray(hits[..., 0].T), jnp.asarray(hits[..., 1].T)))
     clear = np.append(np.full(lens.count + 1, True), ~np.array(blocks))
-    return not np.any(np.asarray(edges)[clear] < 0)
+    return not np.any(np.asarray(edges)[clear] < -_ON_RIM)  # a ray at the rim of the stop grazes
 
 
 def _pieces(lens: Lens) -> list[tuple[int, int]]:

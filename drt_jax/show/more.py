@@ -64,13 +64,13 @@ def _axis(lens: Lens, scene: Scene) -> Iterator[tuple[str, Figure]]:
     waves = np.unique(np.concatenate([own, np.linspace(own.min(), own.max(), _WAVES)]))
     heights = np.linspace(1 / _HEIGHTS, 1, _HEIGHTS)
     found = axial_colour(lens, Scene.point(0.0, scene.distance, waves), heights)
-    figure, axes = new(1, 1, 5.5, 3.8)
+    figure, axes = new(1, 1, 4.6, 3.3)
     rows = np.searchsorted(waves, own)
     picked = found._replace(paraxial=found.paraxial[rows], real=found.real[rows])
     analyses.legend(aberrations.longitudinal(axes, picked, heights, own))
     yield "Longitudinal aberration", figure
     if len(own) > 1:
-        figure, axes = new(1, 1, 5.5, 3.8)
+        figure, axes = new(1, 1, 4.6, 3.3)
         aberrations.focal_shift(axes, found, waves, float(own[scene.reference(None)]))
         yield "Chromatic focal shift", figure
 
@@ -90,7 +90,7 @@ def _through_focus(lens: Lens, scene: Scene, rule: PupilRule) -> Iterator[tuple[
     focus = np.linspace(-reach, reach, 21)
     sampling = Sampling.of("waves", rule, _CELLS)
     contrast = transfer(lens, scene, [frequency], "waves", focus, sampling).mtf
-    figure, axes = new(1, 1, 5.5, 3.8)
+    figure, axes = new(1, 1, 4.6, 3.3)
     curves = np.asarray(contrast)[..., 0]
     aberrations.mtf_through_focus(axes, focus, curves, _names(scene), frequency)
     yield "MTF through focus", figure
@@ -121,7 +121,7 @@ def _grid(lens: Lens, scene: Scene) -> Iterator[tuple[str, Figure]]:
         middle = scene.reference(None)
         waves = scene.wavelengths[middle : middle + 1]
         found = distortion(lens, Scene.radians(pairs, scene.distance, waves))
-        figure, axes = new(1, 1, 5.5, 4.5)
+        figure, axes = new(1, 1, 4.6, 4.0)
         aberrations.grid_distortion(axes, found, _GRID)
         yield "Grid distortion", figure
 

@@ -12,7 +12,8 @@ Row = tuple[str, ...]
 
 def prescription(lens: Lens, used: Sequence[float] = ()) -> dict[str, list[Row]]:
     """The tables of a lens by title, their header first: surfaces; and, where there are any,
-    coefficients of aspheres and other forms by power, tilts and decentres, and phases.
+    coefficients of aspheres and other forms by power, tilts and decentres, groups that move
+    together, apertures that are no circles about the vertex, and phases.
 
     used: (S,), mm, largest distances of rays from the vertices; () for none.
     """
@@ -20,6 +21,8 @@ def prescription(lens: Lens, used: Sequence[float] = ()) -> dict[str, list[Row]]
         "Surfaces": [*_surfaces(lens, used)],
         "Coefficients of the sag (mm and its powers)": [*_coefficients(lens)],
         "Decentres and tilts": [*_places(lens)],
+        "Groups of surfaces": [*_groups(lens)],
+        "Apertures and obscurations": [*_apertures(lens)],
         "Diffractive surfaces (waves / mm^power)": [*_phases(lens)],
     }
     return {title: rows for title, rows in tables.items() if len(rows) > 1}
@@ -87,6 +90,28 @@ def _places(lens: Lens) -> Iterator[Row]:
     for i in np.flatnonzero(np.any(moved, axis=1) | np.any(tilted, axis=1)):
         both = (", ".join(f"{v:.9g}" for v in row) for row in (moved[i], np.degrees(tilted[i])))
         yield "sensor" if i == lens.count else str(i), *both
+
+
+def _groups(lens: Lens) -> Iterator[Row]:
+    yield "surfaces", "shift x, y, z mm", "tilt about x, y, z degrees", "pivot"
+    if (own := lens.elements) is None:
+        return
+    rows = zip(own.spans, own.about, *map(np.asarray, (own.shift, own.tilt, own.pivot)))
+    for (first, last), about, shift, tilt, pivot in rows:
+        both = (", ".join(f"{v:.9g}" for v in row) for row in (shift, np.degrees(tilt)))
+        yield f"{first} to {last}", *both, f"{pivot:.9g} mm behind surface {about}"
+
+
+def _apertures(lens: Lens) -> Iterator[Row]:
+    yield "surface", "kind", "half widths x, y mm", "centre x, y mm"
+    if (own := lens.apertures) is None:
+        return
+    centres = np.zeros((len(own.kinds), 2)) if own.centre is None else np.asarray(own.centre)
+    for i, kind, blocks, *pairs in zip(
+        own.surfaces, own.kinds, own.blocks, np.asarray(own.sizes), centres
+    ):
+        both = (", ".join(f"{v:.9g}" for v in pair) for pair in pairs)
+        yield str(i), f"{kind}, {'obscuration' if blocks else 'aperture'}", *both
 
 
 def _phases(lens: Lens) -> Iterator[Row]:

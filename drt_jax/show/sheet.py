@@ -174,7 +174,7 @@ def panels(
         figures[title], own = new(len(names), count, 2.4, 2.1)
         axes |= zip(names, np.reshape(own, (len(names), count)).tolist())
     for name, title in _ALONE.items():
-        figures[title], axes[name] = new(1, 1, 5.5, 3.8)
+        figures[title], axes[name] = new(1, 1, 4.6, 3.3)
     _draw_on(axes, found)
     for title in ("Layout", *_BY_FIELD.values()):
         if not figures[title].legends:

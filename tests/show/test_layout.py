@@ -165,7 +165,10 @@ def test_the_edges_of_a_vignetted_beam_are_drawn():
 def test_the_light_between_an_obscuration_and_the_rim_has_four_edges():
     faces = [dict(face) for face in RIMS["surfaces"]]
     faces[0]["obscuration"] = {"circle": 2.0}
-    (fan,) = show.draw(load_lens(RIMS | {"surfaces": faces}), Scene.radians(0.0), rays=3).rays
+    lens = load_lens(RIMS | {"surfaces": faces})
+    # The rim before the stop, as wide as it, grazes the light and stops none.
+    assert layout.beam_of(lens, Scene.point(0.0)).obscured
+    (fan,) = show.draw(lens, Scene.radians(0.0), rays=3).rays
     ends = sorted(path[1, 1] for path in fan)
     np.testing.assert_allclose(ends, [-5.0, -2.0, 2.0, 5.0], atol=1e-6)
 

@@ -66,7 +66,8 @@ TYPED = {
     "surfaces": [
         {"radius": 50.0, "nd": 1.62040204782857, "vd": 60.3242871706773, "thickness": 9.0,
          "semi_diameter": 3, "stop": True, "conic": -0.75,
-         "coefficients": {4: 1.25e-6, 8: -3.5e-12}},
+         "coefficients": {4: 1.25e-6, 8: -3.5e-12},
+         "obscuration": {"circle": 0.5, "centre": [0, 0.1]}},
         {"radius": -70.0, "tilt": [1.5, 0, 0], "decentre": [0, 0.25]},
     ],
     "sensor": 80.0,
@@ -84,6 +85,14 @@ def test_a_lens_can_be_typed_in_again():
     (title,) = (name for name in tables if name.startswith("Coefficients"))
     assert tables[title][1:] == [("0", "asphere", "4: 1.25e-06; 8: -3.5e-12")]
     assert tables["Decentres and tilts"][1:] == [("1", "0, 0.25", "1.5, 0, 0")]
+    assert tables["Apertures and obscurations"][1:] == [
+        ("0", "circle, obscuration", "0.5, 0.5", "0, 0.1")
+    ]
+    grating = {"radius": "inf", "phase": {"form": "linear", "coefficients": {"y": 300.0}}}
+    plain = {"radius": "inf", "glass": "N-BK7", "thickness": 2, "semi_diameter": 3, "stop": True}
+    tables = show.prescription(load_lens({"surfaces": [plain, grating], "sensor": 50}))
+    (title,) = (name for name in tables if name.startswith("Diffractive"))
+    assert tables[title][1:] == [("1", "linear", "1", "y: 300")]
 
 
 @pytest.mark.slow
