@@ -106,7 +106,10 @@ def draw(lens: Lens, scene: Scene | None = None, rays: int = 7) -> Drawing:
     outwards = (high - low) / np.linalg.norm(high - low) * 0.15 * reach
     blades = [np.stack([low, low - outwards]), np.stack([high, high + outwards])]
     sensor = _sensor(lens, paths, reach)
-    numbers = [(i, faces[i][-1]) for i in lens.active]
+    tops = {i: faces[i][-1, 1] for i in lens.active}
+    for pair, outline in zip(_pieces(lens), glass):
+        tops |= {i: max(tops[i], np.max(outline[:, 1])) for i in pair}
+    numbers = [(i, np.array([faces[i][-1, 0], top])) for i, top in tops.items()]
     return Drawing(glass, mirrors, blades, sensor, paths, vignetted, angles, numbers)
 
 
@@ -360,6 +363,7 @@ def lens_drawing(axes: Axes, drawing: Drawing) -> Axes:
             fontsize=6,
         )
     axes.set_aspect("equal")
+    axes.margins(y=0.1)
     axes.set(xlabel="z from the first vertex (mm)", ylabel="y (mm)")
     return scale_bar(axes, "mm")
 

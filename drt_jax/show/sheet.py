@@ -43,6 +43,8 @@ _CURVE, _FAN, _FREQUENCIES, _RADII = 61, 65, 32, 61
 _STEP, _PARTS = 6, (0.25, 0.5)
 # Highest frequency of transfer functions, cycles/mm, unless the diffraction limit is lower.
 _LINES = 200.0
+# The contrast of a spot is nothing above this over its RMS size.
+_FADED = 2.5
 # Order of the spot rule, degree of polynomials, cells for MTF, least and most cells for energy.
 _ORDER, _DEGREE, _CELLS, _LEAST, _MOST = 8, 10, 64, 128, 384
 # Names of axes: those with one for each field, and those of curves, by the titles of their panels.
@@ -222,7 +224,7 @@ def analysed(
     say("tracing waves")
     cone = spots.solid_angle[len(some), middle]
     limit = 2e3 * np.sqrt(cone / np.pi) / float(scene.wavelengths[middle])
-    lines = np.linspace(0, min(limit, _LINES) if limit > 0 else _LINES, _FREQUENCIES)
+    lines = np.linspace(0, highest(limit, spots.rms[: len(some)]), _FREQUENCIES)
     radii, model, cells = _circles(spots, len(some))
     beams = beams_of(lens, at(wide), beam_rule(_DEGREE, rule.symmetry, rule))
     asked = scene.wavelengths, scene.spectrum, jnp.asarray(lines), radii
@@ -345,6 +347,13 @@ def _waves(
     )
     split = count * each
     return joined(contrast[:split]), joined(limit[:split])[0, 0], contrast[split:], energy
+
+
+def highest(limit: float, sizes: np.ndarray) -> float:
+    """The highest frequency that is drawn, cycles/mm: the diffraction limit, if there is one, 200,
+    or where the contrast of the smallest of RMS spot sizes (F,), mm, has fallen to nothing."""
+    blur = np.min(sizes, initial=np.inf, where=np.isfinite(sizes) & (sizes > 0))
+    return min(limit if limit > 0 else _LINES, _LINES, rounded_up(_FADED / blur, (1, 2, 4, 10)))
 
 
 def _circles(spots: Spots, shown: int) -> tuple[Array, Model, int]:

@@ -14,7 +14,7 @@ from drt_jax.image.fans import AxialColour, RayFans
 from drt_jax.lens.seidel import ThirdOrder
 from drt_jax.show import analyses, figures
 from drt_jax.show.figures import FIELD_COLOURS
-from drt_jax.show.sheet import analysed
+from drt_jax.show.sheet import analysed, highest
 
 WAVES = (0.6, 0.53, 0.48)
 LENS = drt_jax.load_lens("cooke_triplet")
@@ -96,6 +96,13 @@ def test_scales_are_round_and_hold_every_number():
     assert figures.rounded_up([0.3, -2.4, np.inf]) == 3 and figures.rounded_up([]) == 1
     assert figures.rounded_up(1.2e-4) == pytest.approx(1.5e-4)
     assert figures.rounded_up(0.034, (1, 2, 5, 10)) == pytest.approx(0.05)
+
+
+def test_frequencies_end_where_contrast_does():
+    """At 200 cycles/mm, at the limit, or for a telescope of 28 um at 100."""
+    assert highest(900.0, np.array([0.005, np.inf])) == 200
+    assert highest(150.0, np.array([0.005])) == 150 and highest(0.0, np.array([1e-9])) == 200
+    assert highest(570.0, np.array([0.028, 0.147])) == 100
 
 
 def test_fans_have_one_scale_with_symbols_and_units():
