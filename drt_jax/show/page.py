@@ -15,6 +15,8 @@ Part = Sequence[Sequence[str]] | str | Figure | pathlib.Path
 _LARGEST = 150_000
 # Widest figure, inches, that stands in one of two columns.
 _COLUMN = 6.5
+# Most characters of a row of a table there.
+_LONGEST = 80
 _STYLE = """
 :root { color-scheme: light dark; font: 16px/1.5 system-ui, sans-serif }
 body { max-width: 90rem; margin: 0 auto; padding: 1rem }
@@ -28,6 +30,7 @@ figure :is(img, svg) { width: 100%; height: auto } .both figure :is(img, svg) { 
 .wide { overflow-x: auto } pre { overflow-x: auto; font-size: .85rem }
 table { border-collapse: collapse; font-variant-numeric: tabular-nums }
 th, td { padding: .2rem .7rem; text-align: left; white-space: nowrap }
+th { white-space: normal; vertical-align: bottom }
 tr { border-bottom: 1px solid #8885 }
 """
 
@@ -36,12 +39,11 @@ def page(title: str, parts: Sequence[tuple[str, Part]]) -> str:
     """A page of HTML that needs no other file.
 
     parts: headings, each with rows of a table, text, a Markdown table, a figure or a PNG file. On a
-        wide window, figures of at most 6.5 inches stand in two columns.
+        wide window, figures of at most 6.5 inches, and tables of short rows, stand in two columns.
     """
     body = [f"<h1>{html.escape(title)}</h1><main>"]
     for heading, part in parts:
-        narrow = isinstance(part, Figure) and part.get_figwidth() <= _COLUMN
-        kind = "" if narrow else ' class="both"'
+        kind = "" if _narrow(part) else ' class="both"'
         body.append(f"<section{kind}><h2>{html.escape(heading)}</h2>{_shown(part)}</section>")
     head = '<meta charset="utf-8"><meta name="viewport" content="width=device-width">'
     head += f"<title>{html.escape(title)}</title><style>{_STYLE}</style>"
@@ -50,6 +52,15 @@ def page(title: str, parts: Sequence[tuple[str, Part]]) -> str:
         + "\n".join(body)
         + "\n</main></body></html>\n"
     )
+
+
+def _narrow(part: Part) -> bool:
+    """Whether a part fits into one of two columns."""
+    if isinstance(part, Figure):
+        return part.get_figwidth() <= _COLUMN
+    if isinstance(part, str | pathlib.Path):
+        return False
+    return max(sum(map(len, map(str, row))) for row in part) <= _LONGEST
 
 
 def _shown(part: Part) -> str:

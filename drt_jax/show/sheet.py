@@ -173,7 +173,7 @@ def panels(
     figures["Layout"], axes["layout"] = new(1, 1, 11.0, 4.5)
     for title in dict.fromkeys(_BY_FIELD.values()):
         names = [name for name in _BY_FIELD if _BY_FIELD[name] == title]
-        figures[title], own = new(len(names), count, 2.4, 2.1)
+        figures[title], own = new(len(names), count, 2.1, 1.9)
         axes |= zip(names, np.reshape(own, (len(names), count)).tolist())
     for name, title in _ALONE.items():
         figures[title], axes[name] = new(1, 1, 4.6, 3.3)

@@ -38,8 +38,8 @@ def test_a_page_holds_tables_text_figures_and_pictures_and_needs_no_other_file(t
     assert "<pre>if x &lt; 3:\n  stop</pre>" in text and text.count("<svg") == 1
     assert 'src="data:image/png;base64,' in text
     assert not re.findall(r'(?:src|href)="(?!data:|#)', text)
-    # Only the figure is narrow enough for one of two columns.
-    assert text.count('<section class="both">') == 4 and text.count("<section>") == 1
+    # The first table and the figure are narrow enough for one of two columns.
+    assert text.count('<section class="both">') == 3 and text.count("<section>") == 2
 
 
 def test_a_figure_of_many_points_is_drawn_as_pixels():
