@@ -57,7 +57,7 @@ ROOMS = {
     "drt_jax/lens": 1478,
     "drt_jax/pupil": 776,
     "drt_jax/rays": 1314,
-    "drt_jax/show": 1140,
+    "drt_jax/show": 1143,
     "experiments": 490,
     "experiments/designing": 575,
     "experiments/imaging": 461,

@@ -49,8 +49,9 @@ def mtf_through_focus(
         axes.plot(focus, both[:, 1], "--", color=hue)
     axes.axvline(0, color="0.7", linewidth=0.6, zorder=0)
     axes.set(ylim=(0, 1.02), xlim=(np.min(np.asarray(focus)), np.max(np.asarray(focus))))
-    axes.set(xlabel="shift of the sensor (mm)")
-    axes.set_ylabel(f"MTF at {frequency:.4g} cycles/mm, T solid, S dashed")
+    axes.locator_params(axis="x", nbins=5)
+    axes.set_xlabel("shift of the sensor (mm); T solid, S dashed")
+    axes.set_ylabel(f"MTF at {frequency:.4g} cycles/mm")
     axes.legend(fontsize=6, frameon=False)
     return axes
 

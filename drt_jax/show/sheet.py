@@ -178,6 +178,8 @@ def panels(
     for name, title in _ALONE.items():
         figures[title], axes[name] = new(1, 1, 4.6, 3.3)
     _draw_on(axes, found)
+    for own in itertools.chain(*(axes[name] for name in _BY_FIELD)):
+        own.yaxis.label.set_fontsize(8)
     for title in ("Layout", *_BY_FIELD.values()):
         if not figures[title].legends:
             keys = [*_keys(found)]
