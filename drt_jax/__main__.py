@@ -12,6 +12,7 @@ import sys
 import time
 import warnings
 from collections.abc import Callable, Iterable, Iterator
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -33,7 +34,9 @@ from .pupil.rules import Gauss, Pattern, PupilRule, Symmetry, gauss_points, symm
 from .rays.status import Status
 from .show import glasses
 from .show.layout import ENDS, Beam, beam_of
+from .show.more import more_panels
 from .show.page import Part, page
+from .show.prescription import prescription
 from .show.sheet import panels, sheet
 
 _LINES = (0.6562725, 0.5875618, 0.4861327)  # C, d, F
@@ -41,6 +44,7 @@ _LINES = (0.6562725, 0.5875618, 0.4861327)  # C, d, F
 _ORDERS, _TOLERANCE = (14, 20), 1e-3
 _MISSING = "warn: leave out what the package has not and rays can go on without, and say so"
 _DEFOCUS = 3.0  # a spot larger than this many times the smallest spot is out of focus
+_WAVES = 5  # of more wavelengths of a file, the primary, longest and shortest are shown
 _NO_SIZE = 1e-9  # mm, mrad: a smaller spot is only rounding error
 
 
@@ -61,12 +65,14 @@ def _options(argv: list[str] | None) -> argparse.Namespace:
     names = ", ".join(lens_names())
     show.add_argument("lens", help=f".yaml, .zmx or .seq file, or a bundled name: {names}")
     own = "default: those of a .zmx or .seq file, else"
-    ends = "default: the primary, longest and shortest of a .zmx or .seq file, else"
+    ends = "default: those of a .zmx or .seq file with their weights, else"
     show.add_argument("--field", type=float, nargs="+", help=f"degrees; {own} 0 7 10")
     show.add_argument("--distance", type=float, help=f"to the object, mm; {own} inf")
     show.add_argument("--wavelengths", type=float, nargs="+", help=f"um; {ends} C, d and F")
     show.add_argument("--missing", choices=("error", "warn"), default="error", help=_MISSING)
     show.add_argument("--html", action="store_true", help="a page of tables and figures instead")
+    more = "a page with more figures, such as through-focus MTF and PSF; a minute longer"
+    show.add_argument("--all", action="store_true", help=more)
     ends = "of the sheet or page; default: LENS.png or LENS.html here"
     show.add_argument("--out", type=pathlib.Path, help=ends)
     about = "write a lens as a file of another program; says what is not in it"
@@ -88,37 +94,23 @@ def first_rows(lens: Lens, found: FirstOrder, wavelength: float) -> Iterator[tup
     yield "wavelength", f"{wavelength:g} um"
     air = float(found.effective_focal_length)
     both = "" if math.isclose(air, abs(found.focal_length)) else f" ({air:.6g} mm in air)"
-    yield "focal length", f"{found.focal_length:.6g} mm{both}, f/{found.f_number:.4g}"
-    yield "back focal distance", f"{found.back_focal_distance:.6g} mm"
+    yield "focal length", f"{found.focal_length:.6g} mm{both} (EFL)"
+    yield "working f-number", f"f/{found.f_number:.4g}"
+    yield "back focal length", f"{found.back_focal_distance:.6g} mm (BFL)"
     for name, image_of, end in (
-        ("entrance", found.entrance_pupil, "first"),
-        ("exit    ", found.exit_pupil, "last"),
+        ("entrance pupil", found.entrance_pupil, "first"),
+        ("exit pupil", found.exit_pupil, "last"),
     ):
         place = f"at {image_of.position + 0.0:.5g} mm from the {end} vertex"
-        yield f"{name} pupil", f"{2 * image_of.semi_diameter:.5g} mm wide, {place}"
-    yield "sensor", f"{float(lens.sensor):.6g} mm from the first vertex"
+        yield name, f"diameter {2 * image_of.semi_diameter:.5g} mm, {place}"
+    yield "stop", f"surface {lens.stop}, diameter {2 * float(lens.semi_diameter[lens.stop]):.5g} mm"
+    yield "sensor", f"{float(lens.sensor):.6g} mm from the first vertex (total track)"
     if lens.afocal:
         far = float(found.image_distance) - float(lens.vertices[-2])
         vergence = f"{1e3 / far if far else math.inf:.4g} dioptres behind the last vertex"
         yield "vergence", f"{vergence}, 0 for collimated light"
     else:
         yield "paraxial focus", f"{found.image_distance:.6g} mm from the first vertex"
-
-
-def surface_rows(lens: Lens) -> Iterator[tuple[str, ...]]:
-    """The prescription of a lens, with a row for each surface."""
-    yield "surface", "radius mm", "conic", "form", "thickness mm", "medium", "semi-diameter mm"
-    gaps = [*np.asarray(lens.thickness), float(lens.sensor - lens.vertices[-2])]
-    numbers = zip(*map(np.asarray, (lens.curvature, lens.conic, lens.semi_diameter)))
-    for i, ((curvature, conic, semi), gap) in enumerate(zip(numbers, gaps)):
-        radius = f"{1 / curvature:.6g}" if curvature else "plane"
-        medium = "mirror" if lens.mirrors[i] else lens.glasses[i + 1]
-        if medium.startswith("model "):
-            nd, vd = map(float, medium.split()[1:3])
-            medium = f"nd {nd:.4f} vd {vd:.4g}"
-        name = f"{i}, stop" if i == lens.stop else str(i)
-        shape = "" if not np.any(lens.coefficients[i]) else lens.forms[i]
-        yield name, radius, f"{conic:.5g}", shape, f"{gap:.6g}", medium, f"{semi:.5g}"
 
 
 def focus_lines(found: FirstOrder, wavelength: float, axial: Beam) -> Iterator[str]:
@@ -143,16 +135,18 @@ def field_rows(
     wavelengths = np.asarray(scene.wavelengths).tolist()
     spots = [f"spot at {wavelength:.3f}" for wavelength in wavelengths]
     place, unit, size = ("angle", "mrad", "urad") if lens.afocal else ("height", "mm", "um")
-    yield "field", f"image {place}", *spots, "light", "surfaces that clip"
+    yield "field", f"image {place}", *spots, "transmitted", "limiting surfaces"
     yield "deg", unit, *(f"RMS {size}" for _ in spots), "%", ""
     middle, symmetry = scene.reference(None), symmetry_of(lens, scene.field)
     whole = not any(beam.clips for beam in beams)
     for field, point, beam in zip(fields, scene.each(), beams):
-        rough, found = (_moments(lens, point, _rule(lens, n, symmetry, whole)) for n in _ORDERS)
-        light = 100 * float(found.throughput[middle])
-        if not light > 0:
-            yield f"{field:.4g}", f"! {_why_dark(lens, point, Gauss(8, symmetry))}"
+        try:
+            rules = (_rule(lens, order, symmetry, whole) for order in _ORDERS)
+            rough, found = (psf_moments(lens, point, rule) for rule in rules)
+        except ValueError as error:  # no light arrives in one of the wavelengths
+            yield f"{field:.4g}", f"! {error}"
             continue
+        light = 100 * float(found.throughput[middle])
         cut = "; ".join(filter(None, (", ".join(map(str, beam.clipping)), *beam.ends))) or "none"
         squares = [np.trace(np.asarray(m.covariance), axis1=1, axis2=2) for m in (found, rough)]
         sizes = [f"{1e3 * s:.4g}" if s > _NO_SIZE else "<1e-6" for s in np.sqrt(squares[0])]
@@ -170,20 +164,10 @@ def field_rows(
             yield f"  ! rays that would have to step back do not arrive{where}"
         if field == 0 and f"{light:.2f}" != "100.00" and not (beam.obscured and not beam.ends):
             share = f"{100 - light:.2g} % of the light that fills the stop"
-            yield f"  ! on the axis {share} does not arrive; surfaces that clip: {cut}"
+            yield f"  ! on the axis {share} is vignetted; limiting surfaces: {cut}"
 
 
-_moments = jit(lambda lens, scene, rule: psf_moments(lens, scene, rule), ONCE)
 _first_order = jit(first_order, ONCE)
-
-
-def _why_dark(lens: Lens, scene: Scene, rule: PupilRule) -> str:
-    """The reason why no light of a scene arrives."""
-    try:
-        psf_moments(lens, scene, rule)
-    except ValueError as error:
-        return str(error)
-    return "no light arrives"
 
 
 def _rule(lens: Lens, order: int, symmetry: Symmetry, whole: bool) -> PupilRule:
@@ -262,33 +246,48 @@ def _warnings_on_stdout() -> Iterator[None]:
         yield
 
 
-def _view(options: argparse.Namespace) -> tuple[Lens, list[float], float, list[float]]:
-    """The lens, fields in degrees, the distance in mm and wavelengths in um.
-
-    Options override the values of a .zmx or .seq file. The middle wavelength is the primary one.
-    `options.note` is set to a line on the wavelengths of the file that are not shown, or to "".
+class _View(NamedTuple):
+    """What is shown: a lens, fields in degrees, the distance in mm, wavelengths in um, the middle
+    one of which is the reference, their weights, and a line on what of a file is left out, or "".
     """
+
+    lens: Lens
+    fields: list[float]
+    distance: float
+    wavelengths: list[float]
+    weights: list[float]
+    note: str = ""
+
+
+def _view(options: argparse.Namespace) -> _View:
+    """What the options and a file ask for. Options override the values of a .zmx or .seq file."""
     fields, distance, waves, note = [0.0, 7.0, 10.0], math.inf, list(_LINES), ""
+    weights = {wave: 1.0 for wave in waves}
     if pathlib.Path(options.lens).suffix.lower() in (".zmx", ".seq"):
         system = load_system(options.lens, options.missing)
-        lens, distance, primary = system.lens, system.distance, system.wavelengths[system.primary]
-        ends = [w for w in (system.wavelengths.max(), system.wavelengths.min()) if w != primary]
-        waves = [*map(float, (*ends[:1], primary, *ends[1:]))]
+        lens, distance = system.lens, system.distance
+        primary = float(system.wavelengths[system.primary])
+        weights = dict(zip(map(float, system.wavelengths), map(float, system.wavelength_weights)))
+        others = sorted({*weights} - {primary}, reverse=True)
+        if len(others) >= _WAVES and options.wavelengths is None:
+            left = ", ".join(f"{w:.4g}" for w in others[1:-1])
+            note, others = (
+                f"  ! wavelengths of the file left out: {left} um",
+                [others[0], others[-1]],
+            )
+        middle = (len(others) + 1) // 2
+        waves = [*others[:middle], primary, *others[middle:]]
         angles = system.fields
-        others = sorted({*map(float, system.wavelengths)} - {*waves})
-        weights = {*map(float, system.wavelength_weights)}
-        if options.wavelengths is None and (others or len(weights) > 1):
-            shown, left = (", ".join(f"{w:.4g}" for w in some) for some in (waves, others))
-            note = f"  ! wavelengths shown, of equal weight: {shown} um; left out: {left or 'none'}"
         if angles is not None and not np.any(angles[:, 0]):
             fields = np.unique(np.round(np.degrees(angles[:, 1]), 12)).tolist()
         elif options.field is None:
             warnings.warn("the file has no fields along y alone: --field 0 7 10", stacklevel=2)
     else:
         lens = load_lens(options.lens, options.missing)
-    options.note = note
     distance = distance if options.distance is None else options.distance
-    return lens, options.field or fields, distance, options.wavelengths or waves
+    waves = options.wavelengths or waves
+    shares = [weights.get(wave, 1.0) for wave in waves]
+    return _View(lens, options.field or fields, distance, waves, shares, note)
 
 
 def run_show(options: argparse.Namespace) -> None:
@@ -296,37 +295,42 @@ def run_show(options: argparse.Namespace) -> None:
     if not all(abs(field) < 90 for field in options.field or ()):
         raise ValueError("--field: must be within 90 degrees")
     with _warnings_on_stdout():
-        lens, fields, distance, waves = _view(options)
+        lens, fields, distance, waves, weights, note = _view(options)
         middle = waves[len(waves) // 2]
-        scene = checked_scene(lens, Scene.degrees(fields, distance, np.array(waves)))
+        shown = Scene.degrees(fields, distance, np.array(waves), wavelength_weights=weights)
+        scene = checked_scene(lens, shown)
         found = jax.tree.map(lambda a: a.item(), _first_order(lens, distance, np.array([middle])))
-        about = f"{lens.count} surfaces, the stop is number {lens.stop}"
+        about = f"{lens.count} surfaces, stop: surface {lens.stop} (counted from 0)"
         first = [*first_rows(lens, found, middle)]
         _write([f"{lens.name}: {about}", *(f"  {name:<19}  {value}" for name, value in first)])
         _show_task("tracing; another kind of lens is compiled first, for half a minute or less")
         axial = beam_of(lens, Scene.point(0.0, distance, middle))
         beams = [beam_of(lens, point) for point in scene.each()]
         focus = [] if lens.afocal else focus_lines(found, middle, axial)
-        notes = _write([*focus, *filter(None, [options.note]), ""])
+        notes = _write([*focus, *filter(None, [note]), ""])
         table = _write(field_rows(lens, scene, fields, beams))
         notes += _write(aperture_lines(lens, beams))
-        kind = ".html" if options.html else ".png"
+        web = options.html or options.all
+        kind = ".html" if web else ".png"
         out = options.out or pathlib.Path(f"{pathlib.Path(options.lens).stem}{kind}")
         symmetry, cut = symmetry_of(lens, scene.field), any(beam.clips for beam in beams)
         rule = Clipped(8, symmetry, 8, may_cross(lens)) if cut else Gauss(8, symmetry)
         view = lens, scene, rule, _show_task
-        if options.html:
+        if web:
             rows = [row for row in table if not isinstance(row, str)]
             lines = [line for line in (*notes, *table) if isinstance(line, str) and line]
-            parts: list[tuple[str, Part]] = [("First-order data", first), ("Spots", rows)]
+            parts: list[tuple[str, Part]] = [("First-order data", first), ("Spots and light", rows)]
             parts += [("Warnings", "\n".join(lines))] if lines else []
-            parts += [("Surfaces", [*surface_rows(lens)]), *panels(*view).items()]
+            used = np.max([beam.wide for beam in beams], axis=0)[:-1]
+            parts += [*prescription(lens, used).items(), *panels(*view).items()]
+            parts += [*more_panels(lens, scene, _show_task).items()] if options.all else []
             out.write_text(page(f"{lens.name}: {about}", parts), encoding="utf-8")
         else:
             figure = sheet(*view)
-            figure.supxlabel(options.note.strip(" !"), fontsize=7, x=0.01, ha="left")
+            figure.text(0.01, 0.01, note.strip(" !"), fontsize=7)
             figure.savefig(out)
-    _write([f"drawn in {out}"])
+    size = f", {out.stat().st_size / 1024:.0f} kB" if web else ""
+    _write([f"drawn in {out}{size}"])
 
 
 def run_check(options: argparse.Namespace) -> None:

@@ -41,11 +41,14 @@ ALLOWED = {
     "show": set(),
 }
 # Drawings of rays; and the namespace of `learn`.
-ALLOWED_ALL = {"learn.__init__", "show.layout", "show.analyses", "show.sheet", "show.glasses"}
+ALLOWED_ALL = {"learn.__init__"} | {
+    f"show.{name}"
+    for name in ("aberrations", "analyses", "glasses", "layout", "more", "prescription", "sheet")
+}
 # Most lines of code of each room; no blank, comment, docstring or import is counted. They
 # fall, and rise only by a new capability, whose commit says by how much: text is free, code is not.
 ROOMS = {
-    "drt_jax": 554,
+    "drt_jax": 559,
     "drt_jax/check": 298,
     "drt_jax/design": 2532,
     "drt_jax/files": 2928,
@@ -54,7 +57,7 @@ ROOMS = {
     "drt_jax/lens": 1563,
     "drt_jax/pupil": 776,
     "drt_jax/rays": 1314,
-    "drt_jax/show": 641,
+    "drt_jax/show": 1143,
     "experiments": 490,
     "experiments/designing": 701,
     "experiments/imaging": 461,

@@ -108,6 +108,12 @@ class Operand:
         """The kind, or the name of the function."""
         return self.kind if isinstance(self.kind, str) else self.kind.__name__
 
+    def described(self) -> str:
+        """The operand as a line: its limits or its target, in its unit, and its weight."""
+        ends = [f"{side} {float(getattr(self, side)):.6g}" for side in self.sides]
+        asked = ", ".join(ends) or f"target {float(self.target):.6g}"
+        return f"{self.name}: {asked}, weight {float(self.weight):.4g}"
+
     @property
     def sides(self) -> list[Literal["low", "high"]]:
         """The limits that are given, "low" before "high"."""

@@ -16,6 +16,7 @@ from ..numerics import concrete
 from .least_squares import Search, init, promised_gain, step
 from .limits import Limit
 from .problem import Problem, quick
+from .variables import Variables
 
 # Violations of at most `_NEAR` that remain at the end are removed in at most `_MENDING` more steps,
 # in which constraints are multiplied by `_STIFF`.
@@ -43,6 +44,7 @@ class Optimum(NamedTuple):
     history: (T, 3), merit, largest violation and number of Jacobians after each trial.
     seconds: time of all trials except the first.
     first: time of the first trial, with compilation if it is needed, s.
+    variables: the variables, which name the numbers of the vector.
     """
 
     lens: Lens
@@ -55,6 +57,19 @@ class Optimum(NamedTuple):
     history: np.ndarray
     seconds: float
     first: float
+    variables: Variables
+
+    def __str__(self) -> str:
+        """Ten lines or so: merit, why it ended, limits that are active or violated, variables with
+        units and those at a bound."""
+        times = f"{self.jacobians} Jacobians, {self.first:.1f} + {self.seconds:.1f} s"
+        active = [limit for limit in self.limits if limit.excess > -1e-6 * (1 + abs(limit.bound))]
+        met = "all met" if self.max_violation <= 0 else f"violated by {self.max_violation:.3g}"
+        lines = [f"{self.ended}: merit {self.merit:.6g}, score {self.score:.6g}; {times}"]
+        if self.limits:
+            lines.append(f"  {len(self.limits)} limits, {met}; {len(active)} active")
+        lines += [f"    {limit}" for limit in active[:3]]
+        return "\n".join([*lines, *self.variables.described(self.vector)])
 
     @property
     def converged(self) -> bool:
@@ -200,4 +215,5 @@ def optimise(
         np.array(history, float),
         seconds,
         compiled - begun,
+        problem.variables,
     )

@@ -1,5 +1,6 @@
 """A design problem: variables, a scene and operands."""
 
+import collections
 import dataclasses
 from collections.abc import Sequence
 
@@ -171,6 +172,25 @@ class Problem:
         """Numbers of fields, wavelengths and distances."""
         names = ("fields", "wavelengths", "distances")
         return {name: len(getattr(self, name)) for name in names}
+
+    def __str__(self) -> str:
+        """Ten lines or so: what is varied, traced and asked for."""
+        if not concrete(self):
+            return repr(self)
+        across, up = np.degrees(np.asarray(self.fields)).T
+        fields = ", ".join(f"({x:.4g}, {y:.4g})" if x else f"{y:.4g}" for x, y in zip(across, up))
+        waves = ", ".join(f"{wave:.4g}" for wave in np.asarray(self.wavelengths))
+        far = ", ".join(f"{distance:.6g}" for distance in np.asarray(self.distances))
+        lines = [f"  {operand.described()}" for operand in self.operands]
+        more = [f"  and {len(lines) - 6} more operands"] if len(lines) > 6 else []
+        kinds = collections.Counter(place.kind for place in self.variables.places)
+        varied = ", ".join(f"{count} {kind}" for kind, count in kinds.items())
+        first = [
+            f"{self.variables.lens.name or 'lens'}: variables: {varied}",
+            f"  fields {fields} degrees; object at {far} mm; wavelengths {waves} um",
+            f"  rays of {self.rule}; {len(lines)} operands:",
+        ]
+        return "\n".join([*first, *lines[:6], *more])
 
     def with_order(self, order: int) -> "Problem":
         """The problem with a Gauss rule of another order."""

@@ -13,6 +13,7 @@ from jax import Array
 
 from ..inputs import require, require_one_of, whole_numbers
 from ..lens.lens import Lens
+from ..numerics import Numbers, concrete
 from .media import back_distance
 from .parts import (
     PARTS,
@@ -31,6 +32,14 @@ from .solves import Solve, fix_solves
 _How = Literal["equal", "opposite", "cemented"]
 # Typical change of a coefficient with a bound `sag`, relative to the bound.
 _STEP_OF_SAG = 0.03
+# Most numbers of a kind in a line of text.
+_MOST_TOLD = 8
+_UNITS = {
+    "curvature": "1/mm",
+    "coefficients": "mm^(1 - power)",
+    "tilt": "radians",
+    "phase": "waves/mm^power",
+} | dict.fromkeys(("thickness", "sensor", "decentre", "semi_diameter"), "mm")
 # The parts that cemented neighbours share.
 _SHAPE = ("curvature", "conic", "coefficients")
 
@@ -318,6 +327,34 @@ class Variables:
         low, high, scale, lines = map(both, ("low", "high", "scale", "lines"))
         return cls(first, low, high, scale, solves, lines, places, ties)
 
+    def __str__(self) -> str:
+        """A few lines: numbers by kind with their units, those at a bound by name."""
+        return "\n".join(self.described(self.start)) if concrete(self) else repr(self)
+
+    def described(self, vector: Numbers) -> list[str]:
+        """Lines on the numbers of a vector (N,): a title, a line for each kind with its unit, and
+        the variables at a bound by name, at most four."""
+        numbers = np.asarray(vector) * np.asarray(self.scale)
+        low, high = (np.asarray(bound) * np.asarray(self.scale) for bound in (self.low, self.high))
+        counts = f"{len(self.places)} variables, {len(self.ties)} ties, {len(self.solves)} solves"
+        lines = [f"{self.lens.name or 'lens'}: {counts}"]
+        for kind in dict.fromkeys(place.kind for place in self.places):
+            rows = [k for k, place in enumerate(self.places) if place.kind == kind]
+            each = [f"{_where(self.places[k])}{numbers[k]:.5g}" for k in rows[:_MOST_TOLD]]
+            more = f", ... ({len(rows)})" if len(rows) > _MOST_TOLD else ""
+            unit = f" ({_UNITS[kind]})" if kind in _UNITS else ""
+            lines.append(f"  {kind}{unit}: {', '.join(each)}{more}")
+        near = 1e-6 * np.abs(np.asarray(self.scale))
+        sides = (("low", low, numbers - low), ("high", high, high - numbers))
+        bounds = [
+            f"{place} at its {side} bound {bound[k]:.5g} {_UNITS.get(place.kind, '')}".rstrip()
+            for k, place in enumerate(self.places)
+            for side, bound, room in sides
+            if room[k] <= near[k]
+        ]
+        others = [f"and {len(bounds) - 4} more at a bound"] if len(bounds) > 4 else []
+        return lines + [f"  {line}" for line in (*bounds[:4], *others)]
+
     @property
     def names(self) -> tuple[str, ...]:
         """Names of the variables, such as "curvature 3"."""
@@ -351,6 +388,12 @@ class Variables:
         for solve in self.solves:
             lens = solve.apply(lens)
         return lens
+
+
+def _where(place: Place) -> str:
+    """The surface and the term of a number, for a list of its kind."""
+    where = str(place).removeprefix(place.kind).strip()
+    return f"[{where}] " if where else ""
 
 
 def _refuse_twice(what: str, places: Iterable[Place], reason: str) -> None:

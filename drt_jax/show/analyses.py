@@ -19,7 +19,8 @@ from ..image.chief import Distortion, FieldCurvature
 from ..image.fans import RayFans
 from ..image.psf import GaussianError
 from ..image.spots import Spots
-from .figures import FIELD_COLOURS
+from ..lens.seidel import ThirdOrder
+from .figures import FIELD_COLOURS, rounded_up
 
 # Units of lengths on the sensor, and those of an afocal lens.
 _UNITS = {"um": "urad", "cycles/mm": "cycles/mrad", r"focus \(mm": "focus (1e-3 dioptre"}
@@ -42,7 +43,7 @@ def colours(wavelengths: ArrayLike) -> list[str]:
     return [to_hex(c) for c in ramp(place)]
 
 
-def _coloured(wavelengths: ArrayLike) -> list[dict[str, Any]]:
+def coloured(wavelengths: ArrayLike) -> list[dict[str, Any]]:
     """Colour and label of the curve of each wavelength."""
     waves = np.ravel(np.asarray(wavelengths, float))
     return [{"color": c, "label": f"{w:.4g} um"} for c, w in zip(colours(waves), waves)]
@@ -51,7 +52,7 @@ def _coloured(wavelengths: ArrayLike) -> list[dict[str, Any]]:
 def legend(axes: Axes) -> None:
     """The wavelengths of the curves of an analysis, if there are several."""
     if len({*axes.get_legend_handles_labels()[1]}) > 1:
-        axes.legend(fontsize=5, frameon=False, handlelength=1, markerscale=4)
+        axes.legend(fontsize=6, frameon=False, handlelength=1, markerscale=4)
 
 
 def spots(axes: Axes, found: Spots, field: int, wavelengths: ArrayLike, half: float = 0) -> Axes:
@@ -63,11 +64,11 @@ def spots(axes: Axes, found: Spots, field: int, wavelengths: ArrayLike, half: fl
     centroid = np.asarray(found.centroid)[field]
     points = 1e3 * (np.asarray(found.points)[field] - centroid)
     airy = 1e3 * float(found.airy_radius[field])
-    for rays, style in zip(points, _coloured(wavelengths)):
+    for rays, style in zip(points, coloured(wavelengths)):
         good = np.all(np.isfinite(rays), axis=-1)
         axes.plot(*rays[good].T, ".", markersize=1.5, **style)
     if np.isfinite(airy):
-        axes.add_patch(Circle((0, 0), airy, fill=False, color="black", linewidth=0.8))
+        axes.add_patch(Circle((0, 0), airy, fill=False, color="black", linewidth=0.8, zorder=3))
         shown, farthest = (1e3 * float(a[field]) for a in (spot_radius(found), found.radius))
         half = half or 1.15 * max(shown, airy)
         axes.set(xlim=(-half, half), ylim=(-half, half))
@@ -81,24 +82,40 @@ def spots(axes: Axes, found: Spots, field: int, wavelengths: ArrayLike, half: fl
 
 
 def fan(
-    axes: Axes, found: RayFans, field: int, wavelengths: ArrayLike, sagittal: bool = False
+    axes: Axes,
+    found: RayFans,
+    field: int,
+    wavelengths: ArrayLike,
+    sagittal: bool = False,
+    half: float = 0,
 ) -> Axes:
     """Transverse ray errors of one field, um, along the y axis of the stop or, with `sagittal`,
-    along the x axis."""
+    along the x axis. half: half the height of the plot, um; 0 fits it to the curves."""
     errors, component = (found.sagittal, 0) if sagittal else (found.tangential, 1)
-    for curve, style in zip(np.asarray(errors)[field, ..., component], _coloured(wavelengths)):
-        axes.plot(found.pupil, 1e3 * _finite(curve), **style)
-    axes.axhline(0, color="0.7", linewidth=0.6, zorder=0)
-    axes.axvline(0, color="0.7", linewidth=0.6, zorder=0)
-    axes.set(xlim=(-1, 1))
-    return axes
+    curves = 1e3 * np.asarray(errors)[field, ..., component]
+    name = f"ray error $e_{'yx'[sagittal]}$ (um)"
+    return _over_pupil(axes, found.pupil, curves, wavelengths, name, half)
+
+
+def path_fan(
+    axes: Axes,
+    found: RayFans,
+    field: int,
+    wavelengths: ArrayLike,
+    sagittal: bool = False,
+    half: float = 0,
+) -> Axes:
+    """Optical path differences of one field, waves; arguments as in `fan`, half in waves."""
+    curves = np.asarray(found.sagittal_path if sagittal else found.tangential_path)[field]
+    name = f"OPD along {'yx'[sagittal]} (waves)"
+    return _over_pupil(axes, found.pupil, curves, wavelengths, name, half)
 
 
 def field_curvature(
     axes: Axes, found: FieldCurvature, fields: ArrayLike, wavelengths: ArrayLike
 ) -> Axes:
     """Foci over the field, mm from the sensor: solid lines are tangential, dashed sagittal."""
-    return _over_field(axes, found, fields, wavelengths, "focus (mm), S dashed")
+    return _over_field(axes, found, fields, wavelengths, "focus (mm), T solid, S dashed")
 
 
 def distortion(axes: Axes, found: Distortion, fields: ArrayLike, wavelengths: ArrayLike) -> Axes:
@@ -123,6 +140,7 @@ def illumination(axes: Axes, light: ArrayLike, throughput: ArrayLike, fields: Ar
     axes.plot(_degrees(fields), light, color="black", label="relative illumination")
     axes.plot(_degrees(fields), throughput, "--", color="tab:grey", label="throughput")
     axes.set(xlim=_range(fields), ylim=(0, 1.05), xlabel="field (degrees)")
+    axes.set_ylabel("fraction")
     axes.legend(fontsize=6, loc="lower left", frameon=False)
     return axes
 
@@ -141,9 +159,41 @@ def mtf(
     for both, name, hue in zip(np.asarray(curves), names, itertools.cycle(hues)):
         axes.plot(frequencies, both[0], color=hue, label=name)
         axes.plot(frequencies, both[1], "--", color=hue)
-    axes.set(xlim=(0, np.max(np.asarray(frequencies))), ylim=(0, 1.02), xlabel="cycles/mm")
-    axes.set_title("MTF, S dashed", fontsize=8)
+    axes.set(xlim=(0, np.max(np.asarray(frequencies))), ylim=(0, 1.02))
+    axes.set(xlabel="spatial frequency (cycles/mm)", ylabel="MTF, T solid, S dashed")
     axes.legend(fontsize=6, frameon=False)
+    return axes
+
+
+def mtf_over_field(
+    axes: Axes, fields: ArrayLike, curves: ArrayLike, frequencies: Sequence[float]
+) -> Axes:
+    """MTF (F, 2, N) over the field at N frequencies in cycles/mm, black to grey: solid lines are
+    tangential, dashed sagittal."""
+    for k, frequency in enumerate(frequencies):
+        grey = str(0.6 * k / max(len(frequencies) - 1, 1))
+        label = f"{frequency:.4g} cycles/mm"
+        for line, style, name in zip(np.asarray(curves)[:, :, k].T, ("-", "--"), (label, None)):
+            axes.plot(_degrees(fields), line, style, color=grey, label=name)
+    axes.set(xlim=_range(fields), ylim=(0, 1.02))
+    axes.set(xlabel="field (degrees)", ylabel="MTF, T solid, S dashed")
+    axes.legend(fontsize=6, frameon=False)
+    return axes
+
+
+def seidel(axes: Axes, found: ThirdOrder, wavelength: int = 0) -> Axes:
+    """Third-order transverse aberrations of each surface and their sums, mm, as bars on one scale,
+    which the label gives. wavelength: index of it."""
+    kinds = ThirdOrder._fields[:-1]  # those that are lengths
+    parts = np.stack([np.asarray(part)[:, wavelength] for part in found[:-1]])
+    bars = np.concatenate([parts, parts.sum(axis=1, keepdims=True)], axis=1)
+    spacing, places = 2.2 * rounded_up(bars), np.arange(bars.shape[1])
+    for k, row in enumerate(bars):
+        axes.bar(places, row / spacing, bottom=-k, color=["black"] * (len(row) - 1) + ["0.5"])
+        axes.axhline(-k, color="0.7", linewidth=0.6, zorder=0)
+    axes.set_yticks(-np.arange(len(bars)), [name.replace("_", " ") for name in kinds])
+    axes.set_xticks(places, [*map(str, places[:-1]), "sum"])
+    axes.set(ylim=(0.5 - len(bars), 0.5), xlabel=f"surface; line spacing {spacing:.3g} mm")
     return axes
 
 
@@ -163,7 +213,7 @@ def encircled_energy(
     if 0 < airy < np.inf:
         axes.axvline(1e3 * airy, color="0.7", linewidth=0.8, zorder=0, label="Airy")
     axes.set(xlim=(0, places.max()), ylim=(0, 1.02), xlabel="radius (um)")
-    axes.set_title("encircled energy", fontsize=8)
+    axes.set_ylabel("encircled energy")
     axes.legend(fontsize=6, loc="lower right", frameon=False)
     return axes
 
@@ -215,10 +265,25 @@ def _over_field(
     axes: Axes, curves: Sequence, fields: ArrayLike, wavelengths: ArrayLike, label: str
 ) -> Axes:
     """One or two curves (F, W), the second dashed, along y over the field."""
-    for k, style in enumerate(_coloured(wavelengths)):
+    for k, style in enumerate(coloured(wavelengths)):
         for curve, line in zip(curves, ("-", "--")):
             axes.plot(_finite(np.asarray(curve)[:, k]), _degrees(fields), line, **style)
             style = {"color": style["color"]}  # one entry of a legend
     axes.axvline(0, color="0.7", linewidth=0.6, zorder=0)
-    axes.set(xlabel=label, ylim=_range(fields))
+    axes.set(xlabel=label, ylabel="field (degrees)", ylim=_range(fields))
+    return axes
+
+
+def _over_pupil(
+    axes: Axes, pupil: ArrayLike, curves: ArrayLike, wavelengths: ArrayLike, name: str, half: float
+) -> Axes:
+    """Curves (W, N) over the stop. name: quantity and unit; half: half the height, 0 to fit."""
+    for curve, style in zip(np.asarray(curves), coloured(wavelengths)):
+        axes.plot(np.asarray(pupil), _finite(curve), **style)
+    axes.axhline(0, color="0.7", linewidth=0.6, zorder=0)
+    axes.axvline(0, color="0.7", linewidth=0.6, zorder=0)
+    along = "x" if " along x" in name or "e_x" in name else "y"
+    axes.set(xlim=(-1, 1), xticks=(-1, 0, 1), xlabel=f"stop $P_{along}$", ylabel=name)
+    if half:
+        axes.set(ylim=(-half, half), yticks=(-half, 0, half))
     return axes

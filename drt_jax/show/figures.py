@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+from jax.typing import ArrayLike
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
@@ -47,4 +48,28 @@ def kernels(axes: Sequence[Axes], kernel: np.ndarray, titles: Sequence[str]) -> 
         ax.imshow(values, vmin=0, vmax=np.max(kernel), cmap="magma", origin="lower")
         ax.set_title(title, fontsize=9)
         ax.set(xlabel="x (pixels)", ylabel="y (pixels)")
+    return axes
+
+
+# First digits of scales.
+_DIGITS = (1, 1.5, 2, 3, 4, 5, 6, 8, 10)
+
+
+def rounded_up(values: ArrayLike, digits: Sequence[float] = _DIGITS) -> float:
+    """The largest modulus of values, those that are not finite left out, rounded up to one of the
+    first digits, the last of them 10; 1 for none."""
+    sizes = np.abs(np.asarray(values, float))
+    most = np.max(sizes, initial=0.0, where=np.isfinite(sizes)) or 1.0
+    power = 10.0 ** np.floor(np.log10(most))
+    return float(power * next(step for step in digits if step * power >= most))
+
+
+def scale_bar(axes: Axes, unit: str) -> Axes:
+    """A bar of a fifth of the width of axes or less, at their lower left, with its length."""
+    (left, right), (low, high) = axes.get_xlim(), axes.get_ylim()
+    length = rounded_up(0.08 * (right - left), (1, 2, 5, 10))
+    start, height = left + 0.04 * (right - left), low + 0.04 * (high - low)
+    axes.plot([start, start + length], [height, height], color="black", linewidth=2)
+    axes.text(start, height + 0.02 * (high - low), f"{length:g} {unit}", fontsize=7, va="bottom")
+    axes.set(xlim=(left, right), ylim=(low, high))
     return axes

@@ -23,12 +23,13 @@ from ..numerics import einsum
 from ..pupil.patterns import hexapolar
 from ..rays.rays import trace_rays
 from ..rays.status import Status
-from .figures import FIELD_COLOURS
+from .figures import FIELD_COLOURS, scale_bar
 
 _POINTS = 161
 _RAYS = 600  # rays per trace, so that all traces share one compiled program
 _RINGS, _RIM = 10, 240  # rings of rays that fill the stop, and number of rays on its rim
 _SCANS = 3  # scans of the meridian for the edges of a beam; each refines the last one
+_ON_RIM = 1e-6  # mm: a ray that misses an aperture by less only grazes it
 # Words for rays that do not reach the sensor, other than those clipped by an aperture.
 ENDS = {
     Status.MISSED: "some miss",
@@ -50,6 +51,7 @@ class Drawing(NamedTuple):
         of a vignetted beam, the rays at its edges.
     vignetted: clipped rays of the fans, up to the surface that clips them.
     fields: the angles of the fields, radians.
+    numbers: the number of each surface that bends light, and the top (z, y) of its outline.
     """
 
     glass: list[np.ndarray]
@@ -59,6 +61,7 @@ class Drawing(NamedTuple):
     rays: list[list[np.ndarray]]
     vignetted: list[np.ndarray]
     fields: Sequence[float] = ()
+    numbers: Sequence[tuple[int, np.ndarray]] = ()
 
 
 def draw(lens: Lens, scene: Scene | None = None, rays: int = 7) -> Drawing:
@@ -70,7 +73,7 @@ def draw(lens: Lens, scene: Scene | None = None, rays: int = 7) -> Drawing:
     """
     scene = checked_scene(lens, Scene.point() if scene is None else scene)
     middle = slice(scene.reference(None), scene.reference(None) + 1)
-    points = dataclasses.replace(scene, wavelengths=scene.wavelengths[middle]).each()
+    points = _in_colour(scene, scene.wavelengths[middle]).each()
     angles = [float(point.field[1]) for point in points]
     # A surface that does not bend light is neither a corner of a ray nor a face of glass.
     corners = [*lens.active, lens.count]
@@ -91,9 +94,10 @@ def draw(lens: Lens, scene: Scene | None = None, rays: int = 7) -> Drawing:
         for angle, point, hit in zip(angles, points, hits, strict=True)
     ]
     vignetted = [_path(ray, start, *place) for ray, *place in ends]
-    profiles = np.linspace(*_extents(lens, 1.1 * _widths(lens, hits, reach)), _POINTS, axis=-1)
+    extents = _extents(lens, 1.1 * _widths(lens, hits, reach))
+    profiles = np.linspace(*extents, _POINTS, axis=-1)
     faces = [_placed(lens, i, y, sag(lens, i, 0.0, y)) for i, y in enumerate(profiles)]
-    glass = [np.concatenate([faces[i], faces[j][::-1], faces[i][:1]]) for i, j in _pieces(lens)]
+    glass = [_outline(lens, pair, profiles, faces) for pair in _pieces(lens)]
     pierced = _pierced(lens, profiles)
     mirrors = [
         np.where(pierced[i, :, None], np.nan, faces[i]) for i in np.flatnonzero(lens.mirrors)
@@ -102,7 +106,37 @@ def draw(lens: Lens, scene: Scene | None = None, rays: int = 7) -> Drawing:
     outwards = (high - low) / np.linalg.norm(high - low) * 0.15 * reach
     blades = [np.stack([low, low - outwards]), np.stack([high, high + outwards])]
     sensor = _sensor(lens, paths, reach)
-    return Drawing(glass, mirrors, blades, sensor, paths, vignetted, angles)
+    tops = {i: faces[i][-1, 1] for i in lens.active}
+    for pair, outline in zip(_pieces(lens), glass):
+        tops |= {i: max(tops[i], np.max(outline[:, 1])) for i in pair}
+    numbers = [(i, np.array([faces[i][-1, 0], top])) for i, top in tops.items()]
+    return Drawing(glass, mirrors, blades, sensor, paths, vignetted, angles, numbers)
+
+
+def _outline(
+    lens: Lens, pair: tuple[int, int], profiles: np.ndarray, faces: list[np.ndarray]
+) -> np.ndarray:
+    """The closed outline of a piece of glass with one rim, as it is made: the narrower face is
+    continued by a plane; or, where the faces would then cross, with the rims of its own faces.
+
+    profiles: (S, N), mm, heights of the points of the faces.
+    """
+    low, high = profiles[list(pair), 0].min(), profiles[list(pair), -1].max()
+    wide = [np.concatenate([low[None], profiles[i], high[None]]) for i in pair]
+    made = [
+        _placed(lens, i, y, sag(lens, i, 0.0, np.clip(y, *profiles[i][[0, -1]])))
+        for i, y in zip(pair, wide)
+    ]
+    gaps = [made[1][end, 0] - made[0][end, 0] for end in (0, -1)]
+    inside = faces[pair[1]][_POINTS // 2, 0] - faces[pair[0]][_POINTS // 2, 0]
+    front, back = made if np.all(np.array(gaps) * inside > 0) else (faces[i] for i in pair)
+    return np.concatenate([front, back[::-1], front[:1]])
+
+
+def _in_colour(scene: Scene, wavelengths: ArrayLike) -> Scene:
+    """A scene in one wavelength, (1,) um."""
+    one = jnp.asarray(wavelengths)
+    return dataclasses.replace(scene, wavelengths=one, wavelength_weights=None)
 
 
 class _Traced(NamedTuple):
@@ -120,9 +154,9 @@ class _Traced(NamedTuple):
     clips: np.ndarray
 
 
-def _rays(lens: Lens, scene: Scene, pupil: jax.Array) -> tuple[jax.Array, ...]:
-    rays = trace_rays(lens, scene, pupil)
-    points, directions = rays.points[0], rays.directions[0, :, -1]
+def _in_own_axes(lens: Lens, points: jax.Array, directions: jax.Array) -> tuple[jax.Array, ...]:
+    """Hits, directions and clips of `_Traced`, of points and directions along the axes of the
+    lens."""
     vertex, across, turned = lens.places
     across = jnp.zeros((len(vertex), 2), vertex.dtype) if across is None else across
     own = points - jnp.concatenate([across, vertex[:, None]], axis=1)[None]
@@ -131,16 +165,19 @@ def _rays(lens: Lens, scene: Scene, pupil: jax.Array) -> tuple[jax.Array, ...]:
         directions = directions @ turned[-1]
     hits = own[..., :2]
     clips = clipping_surface(lens, (hits[..., 0].T, hits[..., 1].T))
-    return points, hits, directions, rays.status[0], clips
+    return hits, directions, clips
 
 
-_trace = jit(_rays, ONCE)
+_own = jit(_in_own_axes, ONCE)
 
 
 def _traced(lens: Lens, scene: Scene, pupil: np.ndarray) -> _Traced:
     """Rays of one wavelength through points (Q, 2) of the stop, in units of its radius."""
     filled = np.resize(pupil, (-(-len(pupil) // _RAYS) * _RAYS, 2))
-    found = _trace(lens, scene, jnp.asarray(filled, lens.curvature.dtype))
+    rays = trace_rays(lens, scene, jnp.asarray(filled, lens.curvature.dtype))
+    points = rays.points[0]
+    hits, directions, clips = _own(lens, points, rays.directions[0, :, -1])
+    found = points, hits, directions, rays.status[0], clips
     return _Traced(*(np.asarray(a)[: len(pupil)] for a in found))
 
 
@@ -195,7 +232,7 @@ def beam_of(lens: Lens, scene: Scene) -> Beam:
     scene, middle = checked_scene(lens, scene), scene.reference(None)
     if len(scene.wavelengths) > 1:
         waves = jnp.roll(scene.wavelengths, -middle)[:, None]
-        own, *more = (beam_of(lens, dataclasses.replace(scene, wavelengths=w)) for w in waves)
+        own, *more = (beam_of(lens, _in_colour(scene, w)) for w in waves)
         for each in more:
             own = own._replace(
                 clipping=sorted({*own.clipping, *each.clipping}),
@@ -222,6 +259,25 @@ def beam_of(lens: Lens, scene: Scene) -> Beam:
     return Beam(clipping, ends, obscured, wide, math.sqrt(size), best, float(shift))
 
 
+def even_hits(lens: Lens, scene: Scene) -> np.ndarray:
+    """Hits (W, Q, 2) on the sensor, mm, of rays evenly over the stop from one object point, so that
+    their density is that of the light; inf for a ray that does not arrive."""
+    scene = checked_scene(lens, scene)
+    waves = np.asarray(scene.wavelengths)[:, None]
+    colours = [_in_colour(scene, jnp.asarray(wave)) for wave in waves]
+    return np.stack([beam_hits(lens, colour)[:, -1] for colour in colours])
+
+
+def beam_hits(lens: Lens, scene: Scene) -> np.ndarray:
+    """Hits (Q, S + 1, 2) on all surfaces and the sensor, mm from their vertices, of rays evenly
+    over the stop from one object point, in the middle wavelength; inf for those that do not arrive.
+    """
+    scene, middle = checked_scene(lens, scene), scene.reference(None)
+    wave = scene.wavelengths[middle : middle + 1]
+    found = _traced(lens, _in_colour(scene, wave), hexapolar(_RINGS)[0])
+    return np.where((found.status == Status.OK)[:, None, None], found.hits, np.inf)
+
+
 def _obscured(lens: Lens, hits: np.ndarray) -> bool:
     """Whether obscurations alone clip rays with hits (Q, S + 1, 2), mm."""
     blocks = () if lens.apertures is None else lens.apertures.blocks
@@ -229,7 +285,7 @@ def _obscured(lens: Lens, hits: np.ndarray) -> bool:
         return False
     edges = clearance(lens, (jnp.asarray(hits[..., 0].T), jnp.asarray(hits[..., 1].T)))
     clear = np.append(np.full(lens.count + 1, True), ~np.array(blocks))
-    return not np.any(np.asarray(edges)[clear] < 0)
+    return not np.any(np.asarray(edges)[clear] < -_ON_RIM)  # a ray at the rim of the stop grazes
 
 
 def _pieces(lens: Lens) -> list[tuple[int, int]]:
@@ -297,9 +353,19 @@ def lens_drawing(axes: Axes, drawing: Drawing) -> Axes:
     for blade in drawing.stop:
         axes.plot(*blade.T, color="black", linewidth=2.5, solid_capstyle="butt", zorder=3)
     axes.plot(*drawing.sensor.T, color="black", linewidth=1.5)
+    for number, (z, y) in drawing.numbers:
+        axes.annotate(
+            str(number),
+            (z, y),
+            (0, 2 + 6 * (number % 2)),
+            textcoords="offset points",
+            ha="center",
+            fontsize=6,
+        )
     axes.set_aspect("equal")
+    axes.margins(y=0.1)
     axes.set(xlabel="z from the first vertex (mm)", ylabel="y (mm)")
-    return axes
+    return scale_bar(axes, "mm")
 
 
 def _placed(lens: Lens, i: int, y: np.ndarray, z: ArrayLike) -> np.ndarray:

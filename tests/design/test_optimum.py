@@ -70,6 +70,22 @@ def test_constraints_hold_exactly():
     np.testing.assert_allclose(free, [3, 1], atol=1e-6)
 
 
+def test_a_printed_optimum_is_a_few_lines():
+    """Merit, active limits by name, variables in the units of the lens, and those at a bound."""
+    lens = drt_jax.load_lens("cooke_triplet")
+    variables = Variables.from_lens(lens, [Vary("sensor", low=40.0, high=45.0)])
+    limits = [design.Limit("total_track", "", "high", 60.0, 0.0)]
+    limits.append(design.Limit("air_edge", "surface 1, zone 1", "low", 0.1, -2.0))
+    found = design.Optimum(
+        lens, np.asarray(variables.high), 1e-4, 1e-4, 0.0, limits, "converged",
+        np.array([[1e-4, 0.0, 7.0]]), 2.0, 9.5, variables
+    )  # fmt: skip
+    first, second, third, *rest = str(found).splitlines()
+    assert first == "converged: merit 0.0001, score 0.0001; 7 Jacobians, 9.5 + 2.0 s"
+    assert second == "  2 limits, all met; 1 active" and third == f"    {limits[0]}"
+    assert rest[1:] == ["  sensor (mm): 45", "  sensor at its high bound 45 mm"]
+
+
 def grid(rings):
     rows = [np.zeros((1, 2))]
     for k in range(1, rings + 1):

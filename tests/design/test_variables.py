@@ -5,8 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from drt_jax import load_lens
-from drt_jax.design import Problem, Solve, Tie, Variables, Vary
+from drt_jax import Scene, load_lens
+from drt_jax.design import Operand, Problem, Solve, Tie, Variables, Vary
 from drt_jax.design.parts import PARTS
 from drt_jax.lens.surface import surface_sag
 
@@ -375,3 +375,33 @@ def test_several_sets_of_one_lens_are_one_problem():
     for wrong in ([], [Vary("curvature")], None):
         with pytest.raises(ValueError, match=r"expected Variables.from_lens\(lens"):
             Problem.from_variables(wrong, ["focal_length"])
+
+
+def test_printed_variables_are_a_few_lines_with_units_and_bounds():
+    """The radius of 20 mm is the curvature 0.05; a thickness at its bound is named."""
+    lens = load_lens("cooke_triplet")
+    thick = float(lens.thickness[0])
+    varied = ["curvature", Vary("thickness", (0, 1), low=thick), Vary("sensor")]
+    lines = str(Variables.from_lens(lens, varied)).splitlines()
+    assert len(lines) == 5 and "9 variables, 0 ties, 0 solves" in lines[0]
+    assert lines[1].startswith(f"  curvature (1/mm): [0] {float(lens.curvature[0]):.5g}, [1] ")
+    assert lines[2].startswith(f"  thickness (mm): [0] {thick:.5g}, [1] ")
+    assert lines[3].startswith("  sensor (mm): ")
+    assert lines[4] == f"  thickness 0 at its low bound {thick:.5g} mm"
+    many = Variables.from_lens(lens, [Vary("curvature", low=1.0, high=2.0)])
+    assert str(many).splitlines()[-1] == "  and 2 more at a bound"
+
+
+def test_a_printed_problem_says_what_is_varied_traced_and_asked_for():
+    lens, scene = load_lens("cooke_triplet"), Scene.degrees([0, 10], 1e3, [0.5, 0.6])
+    asked = ["spot", Operand("total_track", high=70.0, weight=2.0), Operand("f_number", target=5)]
+    lines = str(Problem.from_variables(Variables.from_lens(lens, ["sensor"]), asked, scene))
+    title, view, rays, *operands = lines.splitlines()
+    assert title.endswith("variables: 1 sensor")
+    assert view == "  fields 0, 10 degrees; object at 1000 mm; wavelengths 0.5, 0.6 um"
+    assert "order=6" in rays and rays.endswith("3 operands:")
+    assert operands == [
+        "  spot: target 0, weight 1",
+        "  total_track: high 70, weight 2",
+        "  f_number: target 5, weight 1",
+    ]

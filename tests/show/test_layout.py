@@ -100,10 +100,33 @@ def test_the_picture_holds_every_line_and_says_which_field_has_which_colour(fold
     labels = axes.get_legend().get_texts()
     assert [text.get_text() for text in labels] == ["0°", "2.865°"]
     lines = [line for line in axes.lines if len(line.get_xdata())]
-    assert len(lines) == 1 + 14 + 2 + 1 and len(axes.patches) == 1
+    assert len(lines) == 1 + 14 + 2 + 1 + 1 and len(axes.patches) == 1
     colours = [line.get_color() for line in axes.get_legend().get_lines()]
     assert colours == [lines[1].get_color(), lines[8].get_color()] and colours[0] != colours[1]
     assert figure.axes == [axes]
+    *numbers, bar = [text.get_text() for text in axes.texts]
+    assert numbers == [str(i) for i, _ in folded.numbers] and bar.endswith(" mm")
+    start, end = lines[-1].get_xdata()
+    assert end - start == pytest.approx(float(bar.split()[0]))
+
+
+@pytest.mark.slow
+def test_an_element_has_one_rim_and_its_planes_are_planes():
+    """The plane and the sphere of a piece end at the larger of their semi-diameters; the sphere is
+    continued by a plane at its own; where that plane crosses the other face, rims stay apart."""
+    face = {"radius": 20.0, "thickness": 4, "glass": "N-BK7", "semi_diameter": 5, "stop": True}
+    plane = {"radius": "inf", "semi_diameter": 8.0}
+    lens = load_lens({"surfaces": [face, plane], "sensor": 40})
+    (outline,) = show.draw(lens).glass
+    z, y = outline.T
+    rim = np.isclose(np.abs(y), 8)
+    sag = 20 - (20**2 - 5**2) ** 0.5
+    np.testing.assert_allclose(np.unique(np.round(z[rim], 9)), [sag, 4], atol=1e-9)
+    assert np.max(z) == 4 and np.all(np.abs(y[z == 4]) <= 8)
+    back = {"radius": -20.0, "semi_diameter": 8.0}
+    thin = load_lens({"surfaces": [face | {"thickness": 2}, back], "sensor": 40})
+    (outline,) = show.draw(thin).glass
+    assert np.max(np.abs(outline[np.isclose(outline[:, 0], sag), 1])) == pytest.approx(5)
 
 
 # Its beam at 0.1 rad is cut by the rims of both faces, at 0 by none; the planes bend no light, so
@@ -142,7 +165,10 @@ def test_the_edges_of_a_vignetted_beam_are_drawn():
 def test_the_light_between_an_obscuration_and_the_rim_has_four_edges():
     faces = [dict(face) for face in RIMS["surfaces"]]
     faces[0]["obscuration"] = {"circle": 2.0}
-    (fan,) = show.draw(load_lens(RIMS | {"surfaces": faces}), Scene.radians(0.0), rays=3).rays
+    lens = load_lens(RIMS | {"surfaces": faces})
+    # The rim before the stop, as wide as it, grazes the light and stops none.
+    assert layout.beam_of(lens, Scene.point(0.0)).obscured
+    (fan,) = show.draw(lens, Scene.radians(0.0), rays=3).rays
     ends = sorted(path[1, 1] for path in fan)
     np.testing.assert_allclose(ends, [-5.0, -2.0, 2.0, 5.0], atol=1e-6)
 

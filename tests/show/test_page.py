@@ -10,7 +10,7 @@ import pytest
 from PIL import Image
 
 from drt_jax import load_lens, show
-from drt_jax.__main__ import main, surface_rows
+from drt_jax.__main__ import main
 
 BROWSER = next(
     filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), ""
@@ -38,6 +38,8 @@ def test_a_page_holds_tables_text_figures_and_pictures_and_needs_no_other_file(t
     assert "<pre>if x &lt; 3:\n  stop</pre>" in text and text.count("<svg") == 1
     assert 'src="data:image/png;base64,' in text
     assert not re.findall(r'(?:src|href)="(?!data:|#)', text)
+    # The first table and the figure are narrow enough for one of two columns.
+    assert text.count('<section class="both">') == 3 and text.count("<section>") == 2
 
 
 def test_a_figure_of_many_points_is_drawn_as_pixels():
@@ -48,16 +50,49 @@ def test_a_figure_of_many_points_is_drawn_as_pixels():
 
 
 def test_the_prescription_is_that_of_the_lens():
-    header, *rows = surface_rows(load_lens("cooke_triplet"))
-    assert len(rows) == 6 and all(len(row) == len(header) for row in rows)
-    assert rows[0][:3] == ("0", "22.0136", "0") and rows[3][0] == "3, stop"
-    assert [row[5] for row in rows] == ["SK16", "air", "F2", "air", "SK16", "air"]
-    assert next(row for row in [*surface_rows(load_lens("hubble"))][1:] if row[5] == "mirror")
-    model = {"radius": 50.0, "nd": 1.62040204782857, "vd": 60.3242871706773, "thickness": 90.0}
-    header, row = surface_rows(
-        load_lens({"surfaces": [model | {"semi_diameter": 3, "stop": True}]})
-    )
-    assert row[5] == "nd 1.6204 vd 60.32"
+    tables = show.prescription(load_lens("cooke_triplet"), [9.0] * 6)
+    header, *rows = tables["Surfaces"]
+    assert [*tables] == ["Surfaces"] and len(rows) == 6
+    assert all(len(row) == len(header) for row in rows)
+    assert rows[0][:3] == ("0", "22.01359", "3.25896") and rows[3][0] == "3, stop"
+    assert [row[3] for row in rows] == ["SK16", "air", "F2", "air", "SK16", "air"]
+    assert header[6].startswith("used") and rows[0][5:] == ("9.5", "9")
+    surfaces = show.prescription(load_lens("hubble"))["Surfaces"]
+    assert next(row for row in surfaces if row[3] == "mirror")
+
+
+# A model glass, an asphere and a surface out of place.
+TYPED = {
+    "surfaces": [
+        {"radius": 50.0, "nd": 1.62040204782857, "vd": 60.3242871706773, "thickness": 9.0,
+         "semi_diameter": 3, "stop": True, "conic": -0.75,
+         "coefficients": {4: 1.25e-6, 8: -3.5e-12},
+         "obscuration": {"circle": 0.5, "centre": [0, 0.1]}},
+        {"radius": -70.0, "tilt": [1.5, 0, 0], "decentre": [0, 0.25]},
+    ],
+    "sensor": 80.0,
+}  # fmt: skip
+
+
+def test_a_lens_can_be_typed_in_again():
+    """Every number of the file stands in the tables: glass to five digits, coefficients by power,
+    tilts in degrees."""
+    lens = load_lens(TYPED)
+    tables = show.prescription(lens)
+    row = tables["Surfaces"][1]
+    assert row == ("0, stop", "50", "9", "nd 1.62040, vd 60.324", "-0.75", "3")
+    assert tables["Surfaces"][2][5] == "none"
+    (title,) = (name for name in tables if name.startswith("Coefficients"))
+    assert tables[title][1:] == [("0", "asphere", "4: 1.25e-06; 8: -3.5e-12")]
+    assert tables["Decentres and tilts"][1:] == [("1", "0, 0.25", "1.5, 0, 0")]
+    assert tables["Apertures and obscurations"][1:] == [
+        ("0", "circle, obscuration", "0.5, 0.5", "0, 0.1")
+    ]
+    grating = {"radius": "inf", "phase": {"form": "linear", "coefficients": {"y": 300.0}}}
+    plain = {"radius": "inf", "glass": "N-BK7", "thickness": 2, "semi_diameter": 3, "stop": True}
+    tables = show.prescription(load_lens({"surfaces": [plain, grating], "sensor": 50}))
+    (title,) = (name for name in tables if name.startswith("Diffractive"))
+    assert tables[title][1:] == [("1", "linear", "1", "y: 300")]
 
 
 @pytest.mark.slow
@@ -68,10 +103,11 @@ def test_a_browser_shows_the_sheet_at_two_widths(tmp_path, capsys, write_tables)
     page = tmp_path / "lens.html"
     words = ["show", "cooke_triplet", "--html", "--field", "0", "14", "20", "--out", str(page)]
     main(words)
-    assert capsys.readouterr().out.endswith(f"drawn in {page}\n")
+    assert f"drawn in {page}, " in capsys.readouterr().out
     text = page.read_text()
     for title in ("First-order data", "Surfaces", "Layout", "Spots", "Lateral colour"):
         assert f"<h2>{title}</h2>" in text
+    assert len(text) < 900_000  # small enough to mail
     told = "<script>document.body.dataset.wide = document.documentElement.scrollWidth</script>"
     measured = tmp_path / "measured.html"
     measured.write_text(text.replace("</body>", told + "</body>"))
