@@ -1,7 +1,8 @@
 """Designing a lens: variables, operands, least squares, many starts, tolerances."""
 
 from . import least_squares as least_squares
-from .compensation import AsBuilt as AsBuilt, as_built as as_built
+from .assembly import Assembly as Assembly, as_built as as_built
+from .compensation import AsBuilt as AsBuilt
 from .field_rays import FieldRays as FieldRays
 from .glasses import (
     Snap as Snap,
