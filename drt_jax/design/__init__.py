@@ -23,6 +23,12 @@ from .problem import (
     trace_fields as trace_fields,
 )
 from .ray_steps import RaySteps as RaySteps, cosine as cosine
+from .sensitivities import (
+    Sensitivity as Sensitivity,
+    inverse_sensitivity as inverse_sensitivity,
+    sensitivity as sensitivity,
+    yields as yields,
+)
 from .solves import Solve as Solve
 from .starts import (
     Minimum as Minimum,

@@ -170,6 +170,10 @@ class Assembly:
         start = least_squares.init(evaluate, jnp.zeros(count, dtype))
         return jax.lax.scan(step, start, length=_STEPS)[0].vector * parts.sizes
 
+    def free(self, moves: Array) -> Array:
+        """Mask (C,) of the adjustments that are not at their limits."""
+        return jnp.ones(len(moves), bool) if self.parts is None else abs(moves) < self.parts.sizes
+
     def built(self, problem: Problem, lens: Lens) -> AsBuilt:
         """A lens after compensation. Call `placed` before."""
         if self.plain:

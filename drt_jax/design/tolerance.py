@@ -259,7 +259,8 @@ def predict(problem: Problem, perturbed: PerturbedLens, compensator: Given) -> P
     Adjustments count as further deviations z = (p, m) of a lens that is adjusted at first; those
     that are best for p follow from second derivatives of the sum of squares S that they minimise,
     S_mm m + S_mp p = 0. So q is exact to second order if it is this sum; for another criterion the
-    second derivatives of m are left out. Limits of the adjustments do not count.
+    second derivatives of m are left out. An adjustment at its limit stays there; others may exceed
+    theirs.
 
     problem: gives the fields, wavelengths and pupil rule.
     perturbed: the lens and its deviations.
@@ -304,7 +305,9 @@ def _predict(problem: Problem, perturbed: PerturbedLens, assembly: Assembly) -> 
     shares = jnp.repeat(jnp.eye(2, dtype=zero.dtype), np.array([len(zero), len(moves)]), axis=0)
     gradients, rows = jax.lax.map(curved, (jnp.concatenate([units, units[count:]]), shares))
     hessian, square = rows[: len(zero)], rows[len(zero) :]
-    slopes = -matmul(_inverse(square[:, count:]), square[:, :count]).T
+    free = assembly.free(moves)  # an adjustment at its limit stays there
+    pulls = jnp.where(free[:, None] & free[None], square[:, count:], 0)
+    slopes = -matmul(_inverse(pulls), square[:, :count]).T
     whole = values[0], gradients[0], 2 * matmul(jacobian, jacobian.T), hessian
 
     def along(directions: Array) -> Predicted:
@@ -323,6 +326,8 @@ def _inverse(matrix: Array) -> Array:
     size = jnp.sqrt(jnp.abs(jnp.diag(matrix)))
     size = jnp.where(size > 0, size, 1)
     scale = size[:, None] * size[None]
+    if not len(matrix):
+        return matrix
     values, vectors = jnp.linalg.eigh(matrix / scale)
     values = jnp.where(values > _DETERMINED, values, jnp.inf)
     return matmul(vectors / values[None], vectors.T) / scale
