@@ -40,21 +40,23 @@ ALLOWED = {
     "files": {"inputs", "numerics", "lens"},
     "show": set(),
 }
-# Drawings of rays; and the namespace of `learn`.
-ALLOWED_ALL = {"learn.__init__", "show.layout", "show.analyses", "show.sheet", "show.glasses"}
+# Drawings of rays and of designs; and the namespace of `learn`.
+ALLOWED_ALL = {"learn.__init__"} | {
+    f"show.{name}" for name in ("layout", "analyses", "sheet", "glasses", "tolerances")
+}
 # Most lines of code of each room; no blank, comment, docstring or import is counted. They
 # fall, and rise only by a new capability, whose commit says by how much: text is free, code is not.
 ROOMS = {
     "drt_jax": 554,
     "drt_jax/check": 298,
-    "drt_jax/design": 2498,
+    "drt_jax/design": 2843,
     "drt_jax/files": 2928,
     "drt_jax/image": 3041,
     "drt_jax/learn": 656,
     "drt_jax/lens": 1478,
     "drt_jax/pupil": 776,
     "drt_jax/rays": 1314,
-    "drt_jax/show": 641,
+    "drt_jax/show": 673,
     "experiments": 490,
     "experiments/designing": 575,
     "experiments/imaging": 461,

@@ -9,6 +9,7 @@ from .glasses import (
     Snapped as Snapped,
     snap_glasses as snap_glasses,
 )
+from .grades import GRADES as GRADES, Grade as Grade, graded as graded
 from .growth import Growth as Growth, grow as grow, part_of as part_of
 from .least_squares import Evaluation as Evaluation, Search as Search
 from .limits import Limit as Limit

@@ -24,7 +24,7 @@ from .operands import Operand, OperandFunction, OperandName
 from .parts import with_arrays
 from .perturbed import PerturbedLens, Tolerance
 from .problem import Problem, trace_fields
-from .values import kind_of
+from .values import OPERANDS, kind_of
 
 _COUNTED = ("fields", "wavelengths", "distances")
 _STEPS = 5  # of Gauss and Newton: an evaluation, and four trials
@@ -102,8 +102,9 @@ class Assembly:
     @property
     def plain(self) -> bool:
         """True for the spots of all views after "focus" or the like, without a second trace."""
-        usual = dataclasses.replace(self.figure, target=0.0, low=-np.inf, high=np.inf, weight=1.0)
-        return usual == Operand("spot") and self.parts is None and self.held is None
+        one = self.figure
+        whole = not (one.fields or one.distances or one.wavelengths) and one.vignetting
+        return one.kind == "spot" and whole and self.parts is None and self.held is None
 
     @property
     def figure(self) -> Operand:
@@ -196,7 +197,8 @@ def _operand(given: Operand | OperandName | OperandFunction) -> Operand:
     """An operand, or that of a name or function; the target of waves is 1."""
     if isinstance(given, Operand):
         return given
-    return Operand(given, target=float(kind_of(given).of_waves))
+    of_waves = given in OPERANDS and kind_of(given).of_waves
+    return Operand(given, target=float(of_waves))
 
 
 def as_built(problem: Problem, lens: Lens, compensator: Given) -> AsBuilt:

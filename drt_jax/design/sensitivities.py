@@ -133,13 +133,13 @@ def sensitivity(
     if predicted is None:
         built = monte_carlo(problem, perturbed, ends, assembly)
         moves = np.asarray(built.moves)
-        values = held = built.value
+        values = held = np.asarray(built.value)
         if moves.shape[1]:
             fixed = dataclasses.replace(assembly, held=built.moves[-1])
-            held = monte_carlo(problem, perturbed, ends, fixed).value
+            held = np.asarray(monte_carlo(problem, perturbed, ends, fixed).value)
     else:
         both = [predicted, predicted.before or predicted]
-        values, held = (assembly.value(model.at(ends, "second")) for model in both)
+        values, held = (np.asarray(assembly.value(m.at(ends, "second"))) for m in both)
         moves = ends @ np.asarray(predicted.move_slopes)
     figure, parts = assembly.figure, assembly.parts
     factor, unit = _UNITS.get(figure.name, (1.0, ""))

@@ -266,14 +266,21 @@ def predict(problem: Problem, perturbed: PerturbedLens, compensator: Given) -> P
     perturbed: the lens and its deviations.
     compensator: as in `as_built`.
 
-    ValueError as in `as_built`.
+    ValueError as in `as_built`, and for a criterion whose second derivatives are not finite.
     """
     assembly = Assembly.of(compensator).placed(problem, perturbed.lens, perturbed.beam_radius)
     if not concrete((problem, perturbed)):
         return _predict(problem, perturbed, assembly)
     found = _predict(quick(problem), perturbed, assembly)
     # The full search may find rays that aiming does not find.
-    return found if bool(jnp.isfinite(found.nominal)) else _predict(problem, perturbed, assembly)
+    if not bool(jnp.isfinite(found.nominal)):
+        found = _predict(problem, perturbed, assembly)
+    require(
+        bool(jnp.all(jnp.isfinite(found.hessian))),
+        "criterion: its second derivatives are not finite; trace lenses instead, by `sensitivity` "
+        "or `monte_carlo`",
+    )
+    return found
 
 
 @partial(jit, wanted=ONCE)

@@ -23,3 +23,4 @@ from .glasses import glass_map as glass_map
 from .layout import Drawing as Drawing, draw as draw, lens_drawing as lens_drawing
 from .page import page as page
 from .sheet import panels as panels, sheet as sheet
+from .tolerances import sensitivity as sensitivity, yields as yields
