@@ -49,7 +49,7 @@ ALLOWED_ALL = {"learn.__init__"} | {
 ROOMS = {
     "drt_jax": 554,
     "drt_jax/check": 298,
-    "drt_jax/design": 2843,
+    "drt_jax/design": 2846,
     "drt_jax/files": 2928,
     "drt_jax/image": 3041,
     "drt_jax/learn": 656,
