@@ -56,7 +56,7 @@ ROOMS = {
     "drt_jax/lens": 1478,
     "drt_jax/pupil": 776,
     "drt_jax/rays": 1314,
-    "drt_jax/show": 673,
+    "drt_jax/show": 676,
     "experiments": 490,
     "experiments/designing": 575,
     "experiments/imaging": 461,

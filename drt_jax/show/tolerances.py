@@ -14,7 +14,7 @@ _LARGEST = 2.0  # bars are cut at this many times the largest change after compe
 
 def sensitivity(axes: Axes, table: Sensitivity, count: int = 14) -> Axes:
     """The errors that change a criterion most after compensation, largest first: the worse sign,
-    and pale behind it without compensation, as far as it fits.
+    and pale behind it without compensation, cut where it does not fit.
 
     count: largest number of errors.
     """
@@ -29,12 +29,15 @@ def sensitivity(axes: Axes, table: Sensitivity, count: int = 14) -> Axes:
     most = _LARGEST * float(np.max(np.abs(finite), initial=0)) or 1.0
     axes.barh(names, np.minimum(held, most), 0.8, color="0.8", label="before")
     axes.barh(names, np.minimum(after, most), 0.5, color="tab:blue", label="after compensation")
+    for k in np.flatnonzero(held > most):
+        words = f"{held[k]:.3g}" if np.isfinite(held[k]) else "fails"
+        axes.text(most, k, words, ha="right", va="center", fontsize=6, color="0.3")
     axes.set_xlim(min(0.0, 1.05 * float(np.min(finite, initial=0))), 1.02 * most)
     axes.tick_params("y", labelsize=7)
     axes.invert_yaxis()  # the largest on top
     unit = f" ({some.unit})" if some.unit else ""
     axes.set(xlabel=f"{some.criterion}: worse by{unit}")
-    axes.legend(fontsize=7, frameon=False, loc="lower right")
+    axes.legend(fontsize=7, frameon=False, loc="lower center", bbox_to_anchor=(0.5, 1), ncols=2)
     return axes
 
 
