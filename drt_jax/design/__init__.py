@@ -7,13 +7,15 @@ from ..lens.insert import (
     with_stop as with_stop,
 )
 from . import least_squares as least_squares
-from .compensation import AsBuilt as AsBuilt, as_built as as_built
+from .assembly import Assembly as Assembly, as_built as as_built
+from .compensation import AsBuilt as AsBuilt
 from .field_rays import FieldRays as FieldRays
 from .glasses import (
     Snap as Snap,
     Snapped as Snapped,
     snap_glasses as snap_glasses,
 )
+from .grades import GRADES as GRADES, Grade as Grade, graded as graded
 from .growth import Growth as Growth, grow as grow, part_of as part_of
 from .insertions import Insertion as Insertion, insertions as insertions
 from .least_squares import Evaluation as Evaluation, Search as Search
@@ -29,6 +31,12 @@ from .problem import (
     trace_fields as trace_fields,
 )
 from .ray_steps import RaySteps as RaySteps, cosine as cosine
+from .sensitivities import (
+    Sensitivity as Sensitivity,
+    inverse_sensitivity as inverse_sensitivity,
+    sensitivity as sensitivity,
+    yields as yields,
+)
 from .solves import Solve as Solve
 from .starts import (
     Minimum as Minimum,

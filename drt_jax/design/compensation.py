@@ -18,7 +18,7 @@ from ..lens.lens import Lens
 from ..numerics import concrete, matmul, safe_divide, safe_sqrt
 from ..rays.status import Status
 from .field_rays import EXTRAS, FieldRays, symmetry_by_structure
-from .problem import Problem, trace_fields
+from .problem import Problem
 
 # What is adjusted in every lens: the distance of the sensor, or also its tilts about x and y.
 Compensator = Literal["none", "focus", "focus and tilt"]
@@ -30,11 +30,15 @@ class AsBuilt(NamedTuple):
     """A lens as built, after compensation.
 
     squares: (V,), squared RMS radii of the spots, mm^2; inf where rays fail or no light passes.
-    moves: (C,), compensation: the shift of the sensor, mm, then its tilts about x and -y, radians.
+    moves: (C,), compensation: the shift of the sensor, mm, then its tilts about x and -y, radians;
+        or the adjustments of an `Assembly` in the units of its tolerances.
+    value: (), the criterion, see `Assembly`: by default the spot, the root of the mean of the
+        squares, mm. Infinite, away from its target, where rays fail.
     """
 
     squares: Array
     moves: Array
+    value: Array
 
     @property
     def spot(self) -> Array:
@@ -96,28 +100,11 @@ def compensated(lens: Lens, rays: FieldRays, compensator: Compensator) -> tuple[
     failed = jnp.any(light & ~rays.arrives[..., EXTRAS:], axis=(1, 2))
     valid = ~failed & jnp.all(rays.throughput > 0, axis=1)
     squares = jnp.where(valid, jnp.sum(offsets**2, axis=(0, 2)), jnp.inf)
-    return AsBuilt(squares, moves), offsets
-
-
-def as_built(problem: Problem, lens: Lens, compensator: Compensator) -> AsBuilt:
-    """Evaluates a lens at the fields of a problem after compensation.
-
-    Works in `jit`, `vmap` and under differentiation.
-
-    problem: gives the fields, wavelengths and pupil rule.
-    lens: the lens as built.
-    compensator: "none", "focus" (the distance of the sensor) or "focus and tilt" (also its tilts
-        about x and y).
-
-    ValueError for an unknown compensator, for one that the fields do not determine, and for a pupil
-    rule with more symmetry than the lens.
-    """
-    check(problem, lens, compensator)
-    return compensated(lens, trace_fields(problem, lens), compensator)[0]
+    return AsBuilt(squares, moves, jnp.sqrt(jnp.mean(squares))), offsets
 
 
 def check(problem: Problem, lens: Lens, compensator: str) -> None:
-    """Raises the ValueErrors of `as_built`."""
+    """Raises the ValueErrors of `Assembly.placed` that concern the sensor and the pupil rule."""
     require_one_of("compensator", compensator, get_args(Compensator))
     has, needs = problem.rule.symmetry, symmetry_by_structure(lens, axial=True)
     require(

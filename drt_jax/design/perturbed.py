@@ -29,7 +29,7 @@ _WITH_X = ("biconic", "toroid")
 # The keys of `KINDS`, for type checkers and settings; a test compares them.
 ToleranceKind = Literal[
     "radius", "fringes", "irregularity", "wedge", "thickness", "index", "abbe", "shift",
-    "tilt"
+    "tilt", "sensor", "sensor tilt"
 ]  # fmt: skip
 
 
@@ -53,7 +53,7 @@ class _Errors(NamedTuple):
 class Kind(NamedTuple):
     """A kind of deviation.
 
-    whole: what deviates, a "surface" or an "element".
+    whole: what deviates, a "surface", an "element" or the "sensor".
     axes: number of components, 2 for x and y.
     unit: unit of the deviation.
     places: function of a lens, the numbers of the surfaces or elements that can have it.
@@ -212,6 +212,10 @@ KINDS: dict[str, Kind] = {
     "abbe": Kind("surface", 1, "%", _pieces, partial(_with_glass, "abbe"), 100, _NO_GLASS),
     "shift": Kind("element", 2, "mm", _elements, partial(_moved, "shift", 1)),
     "tilt": Kind("element", 2, "arc min", _elements, partial(_moved, "tilt", _MINUTE)),
+    "sensor": Kind("sensor", 1, "mm", lambda lens: [0], partial(_with_part, "sensor", 1)),
+    "sensor tilt": Kind(
+        "sensor", 2, "arc min", lambda lens: [lens.count], partial(_with_part, "tilt", _MINUTE)
+    ),
 }
 
 
@@ -227,6 +231,7 @@ class Tolerance:
         Behind surfaces: "thickness", mm; "index", of the d line; "abbe", per cent.
         Of elements: "shift" along x and y, mm; "tilt" about x and y through the first vertex, arc
         minutes.
+        Of the sensor: "sensor", its distance, mm; "sensor tilt" about x and y, arc minutes.
     size: largest deviation, in these units.
     which: numbers of surfaces or elements, from 0; () for all that have this kind of deviation.
     """
@@ -260,7 +265,8 @@ class Deviation(NamedTuple):
     def __str__(self) -> str:
         kind = KINDS[self.kind]
         axis = f", {'xy'[self.axis]}" if kind.axes > 1 else ""
-        return f"{self.kind} of {kind.whole} {self.place}{axis}"
+        place = "" if kind.whole == "sensor" else f" of {kind.whole} {self.place}"
+        return f"{self.kind}{place}{axis}"
 
 
 @jax.tree_util.register_dataclass
@@ -362,7 +368,7 @@ def _with_parts(
     kinds, groups = {deviation.kind for deviation in deviations}, tuple[int, ...]()
     if any(KINDS[kind].whole == "element" for kind in kinds):
         lens, groups = _with_elements(lens, spans)
-    if "wedge" in kinds:
+    if kinds & {"wedge", "sensor tilt"}:
         lens = with_arrays(lens, ["tilt"])
     if "irregularity" in kinds:
         lens = _with_cylinders(lens)

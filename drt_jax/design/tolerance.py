@@ -1,7 +1,7 @@
 """Many lenses as built: by Monte Carlo simulation, by derivatives, and as an operand of a design.
 
-The figure of merit q of a lens is the mean over its fields of the squared RMS radius of the
-polychromatic spot, after compensation, see `compensation`.
+The figure of merit q of a lens is by default the mean over its fields of the squared RMS radius of
+the polychromatic spot, after compensation; an `Assembly` says what else it may be.
 """
 
 import dataclasses
@@ -23,7 +23,8 @@ from ..lens.lens import Lens
 from ..numerics import Numbers, concrete, matmul, real_array
 from ..pupil.rules import Gauss
 from ..rays.solve import solve_aimed
-from .compensation import AsBuilt, Compensator, check, compensated
+from .assembly import Assembly, Given
+from .compensation import AsBuilt, Compensator, compensated
 from .field_rays import FieldRays, symmetry_by_structure, trace_views
 from .perturbed import KINDS, PerturbedLens
 from .problem import Problem, quick, trace_fields
@@ -33,6 +34,7 @@ _TILE = 50  # number of lenses in a tile
 _DEVIATION = 0.5  # standard deviation of normal deviations, in units of the largest
 # Order of a prediction: gradient of q, Gauss-Newton part of its Hessian, or whole Hessian.
 Order = Literal["first", "rays", "second"]
+_DETERMINED = 1e-10  # smallest eigenvalue, relative to the diagonal, of what adjustments determine
 _ASCENTS = 16  # number of eigenvectors from which ascents start, in both directions
 
 
@@ -82,7 +84,7 @@ def monte_carlo(
     problem: Problem,
     perturbed: PerturbedLens,
     perturbation: np.ndarray,
-    compensator: Compensator,
+    compensator: Given,
     callback: Callable[[int], None] = lambda done: None,
     threads: int | None = None,
     mesh: Mesh | None = None,
@@ -101,18 +103,19 @@ def monte_carlo(
     mesh: devices that share the lenses, of `devices.device_mesh`. A tile then has 50 lenses for
         every device, and `threads` is not used. None for the default device.
 
-    Returns squares (K, V), mm^2, and moves (K, C) of all lenses. ValueError as in `as_built`.
+    Returns squares (K, V), mm^2, moves (K, C) and values (K,) of all lenses. ValueError as in
+    `as_built`.
     """
-    check(problem, perturbed.lens, compensator)
+    assembly = Assembly.of(compensator).placed(problem, perturbed.lens, perturbed.beam_radius)
     shape, width = np.shape(perturbation), len(perturbed.deviations)
     valid = len(shape) == 2 and shape[0] and shape[1] == width
     require(valid, f"perturbation: expected (K, {width}), got shape {shape}")
     rows = np.asarray(perturbation, perturbed.sizes.dtype)
-    many = partial(_many, compensator=compensator)
 
     def traced(problem: Problem, rows: np.ndarray, callback: Callable[[int], None]) -> AsBuilt:
         parts: list[AsBuilt] = []
-        for part in in_tiles(many, (problem, perturbed), rows, _TILE, threads, mesh):
+        whole = problem, perturbed, assembly
+        for part in in_tiles(_many, whole, rows, _TILE, threads, mesh):
             parts.append(part)
             callback(sum(len(part.squares) for part in parts))
         return jax.tree.map(lambda *arrays: np.concatenate(arrays), *parts)
@@ -127,21 +130,21 @@ def monte_carlo(
     return found
 
 
-@partial(jit, wanted=LARGE, static_argnames=("mesh", "compensator"))
+@partial(jit, wanted=LARGE, static_argnames="mesh")
 def _many(
     problem: Problem,
     perturbed: PerturbedLens,
+    assembly: Assembly,
     perturbation: Array,
     mesh: Mesh | None,
-    compensator: Compensator,
 ) -> AsBuilt:
     """The lenses of one tile, shared among the devices of a mesh."""
 
-    def one(problem: Problem, perturbed: PerturbedLens, row: Array) -> AsBuilt:
-        lens = perturbed.lens_of(row)
-        return compensated(lens, trace_fields(problem, lens), compensator)[0]
+    def one(problem: Problem, perturbed: PerturbedLens, assembly: Assembly, row: Array) -> AsBuilt:
+        return assembly.built(problem, perturbed.lens_of(row))
 
-    return shared(jax.vmap(one, (None, None, 0)), mesh, 2)(problem, perturbed, perturbation)
+    many = shared(jax.vmap(one, (None, None, None, 0)), mesh, 3)
+    return many(problem, perturbed, assembly, perturbation)
 
 
 def spots_as_built(
@@ -192,17 +195,19 @@ def spots_as_built(
 
 
 class Predicted(NamedTuple):
-    """A quadratic model of q, the mean squared RMS radius of the spots, mm^2.
+    """A quadratic model of q: a mean square, such as that of the RMS radii of the spots, mm^2, or
+    the mean of another criterion, see `Assembly.measure`.
 
     q(p) = nominal + gradient.p + p^T H p / 2, where p are deviations in units of their largest.
 
     nominal: (), q without deviations.
     gradient: (P,), first derivatives of q.
     gauss: (P, P), Gauss-Newton part of the Hessian, 2 J^T J, with J the derivatives of the
-        residuals.
+        residuals; 0 for a criterion that is no mean square.
     hessian: (P, P), second derivatives of q.
     moves: (C,), compensation without deviations, see `AsBuilt`.
     move_slopes: (P, C), derivatives of the compensation.
+    before: the model with all adjustments held as they are without deviations.
     """
 
     nominal: Array
@@ -211,6 +216,7 @@ class Predicted(NamedTuple):
     hessian: Array
     moves: Array
     move_slopes: Array
+    before: "Predicted | None" = None
 
     def matrix(self, order: Order) -> Array:
         """Matrix (P, P) of an order: 0 for "first", `gauss` for "rays", `hessian` for "second".
@@ -247,42 +253,91 @@ class Predicted(NamedTuple):
         return mean, jnp.sqrt(matmul(self.gradient**2, variances) + pairs)
 
 
-def predict(problem: Problem, perturbed: PerturbedLens, compensator: Compensator) -> Predicted:
+def predict(problem: Problem, perturbed: PerturbedLens, compensator: Given) -> Predicted:
     """Predicts q from exact first and second derivatives by deviations.
+
+    Adjustments count as further deviations z = (p, m) of a lens that is adjusted at first; those
+    that are best for p follow from second derivatives of the sum of squares S that they minimise,
+    S_mm m + S_mp p = 0. So q is exact to second order if it is this sum; for another criterion the
+    second derivatives of m are left out. An adjustment at its limit stays there; others may exceed
+    theirs.
 
     problem: gives the fields, wavelengths and pupil rule.
     perturbed: the lens and its deviations.
     compensator: as in `as_built`.
 
-    ValueError as in `as_built`.
+    ValueError as in `as_built`, and for a criterion whose second derivatives are not finite.
     """
-    check(problem, perturbed.lens, compensator)
+    assembly = Assembly.of(compensator).placed(problem, perturbed.lens, perturbed.beam_radius)
     if not concrete((problem, perturbed)):
-        return _predict(problem, perturbed, compensator)
-    found = _predict(quick(problem), perturbed, compensator)
+        return _predict(problem, perturbed, assembly)
+    found = _predict(quick(problem), perturbed, assembly)
     # The full search may find rays that aiming does not find.
-    return found if bool(jnp.isfinite(found.nominal)) else _predict(problem, perturbed, compensator)
+    if not bool(jnp.isfinite(found.nominal)):
+        found = _predict(problem, perturbed, assembly)
+    require(
+        bool(jnp.all(jnp.isfinite(found.hessian))),
+        "criterion: its second derivatives are not finite; trace lenses instead, by `sensitivity` "
+        "or `monte_carlo`",
+    )
+    return found
 
 
-@partial(jit, wanted=ONCE, static_argnames="compensator")
-def _predict(problem: Problem, perturbed: PerturbedLens, compensator: Compensator) -> Predicted:
-    """`predict` with the solver of the problem: J from one linearised trace, the Hessian by forward
+@partial(jit, wanted=ONCE)
+def _predict(problem: Problem, perturbed: PerturbedLens, assembly: Assembly) -> Predicted:
+    """`predict` with the solver of the problem: J from one linearised trace, Hessians by forward
     over reverse mode. Second derivatives of a whole trace are large to compile and run once.
     """
-    zero = jnp.zeros_like(perturbed.sizes)
-    units = jnp.eye(len(zero), dtype=zero.dtype)
+    moves = jax.lax.stop_gradient(assembly.moves(problem, perturbed.lens))
+    zero = jnp.append(jnp.zeros_like(perturbed.sizes), moves)
+    count, units = len(perturbed.sizes), jnp.eye(len(zero), dtype=zero.dtype)
 
-    def rays(perturbation: Array) -> tuple[tuple[Array, Array], Array]:
-        lens = perturbed.lens_of(perturbation)
-        found, offsets = compensated(lens, trace_fields(problem, lens), compensator)
-        return (jnp.ravel(offsets) / jnp.sqrt(len(found.squares)), found.moves), found.squares
+    def measures(z: Array) -> tuple[Array, Array]:
+        """The residuals of which q is the sum of squares, and q and S."""
+        lens = assembly.adjusted(perturbed.lens_of(z[:count]), z[count:])
+        rays = trace_fields(problem, lens)
+        valid = jnp.all(jnp.isfinite(compensated(lens, rays, "none")[0].squares))
+        residuals, q = assembly.measure(lens, rays)
+        square = jnp.sum(assembly.pull(lens, rays) ** 2)
+        return residuals, jnp.where(valid, jnp.stack([q, square]), jnp.inf)
 
-    (offsets, moves), derivative, squares = jax.linearize(rays, zero, has_aux=True)
-    derivatives, slopes = jax.lax.map(derivative, units)
-    merit = jax.grad(lambda perturbation: jnp.mean(rays(perturbation)[1]))
-    hessian = jax.lax.map(lambda unit: jax.jvp(merit, (zero,), (unit,))[1], units)
-    gradient, gauss = 2 * matmul(derivatives, offsets), 2 * matmul(derivatives, derivatives.T)
-    return Predicted(jnp.mean(squares), gradient, gauss, hessian, moves, slopes)
+    def curved(unit: tuple[Array, Array]) -> tuple[Array, Array]:
+        """Gradient and Hessian, along a vector, of a combination of q and S."""
+        vector, shares = unit
+        gradient = jax.grad(lambda z: jnp.dot(shares, measures(z)[1]))
+        return jax.jvp(gradient, (zero,), (vector,))
+
+    _, derivative, values = jax.linearize(measures, zero, has_aux=True)
+    jacobian = jax.lax.map(derivative, units)
+    shares = jnp.repeat(jnp.eye(2, dtype=zero.dtype), np.array([len(zero), len(moves)]), axis=0)
+    gradients, rows = jax.lax.map(curved, (jnp.concatenate([units, units[count:]]), shares))
+    hessian, square = rows[: len(zero)], rows[len(zero) :]
+    free = assembly.free(moves)  # an adjustment at its limit stays there
+    pulls = jnp.where(free[:, None] & free[None], square[:, count:], 0)
+    slopes = -matmul(_inverse(pulls), square[:, :count]).T
+    whole = values[0], gradients[0], 2 * matmul(jacobian, jacobian.T), hessian
+
+    def along(directions: Array) -> Predicted:
+        """The model for vectors (P, N) of deviations with their adjustments."""
+        nominal, slope, *matrices = whole
+        gauss, hessian = (matmul(matmul(directions, a), directions.T) for a in matrices)
+        slopes = directions[:, count:]
+        return Predicted(nominal, matmul(directions, slope), gauss, hessian, moves, slopes)
+
+    held = along(units[:count])
+    return along(units[:count].at[:, count:].set(slopes))._replace(before=held)
+
+
+def _inverse(matrix: Array) -> Array:
+    """Inverse of a symmetric matrix; 0 along what it does not determine."""
+    size = jnp.sqrt(jnp.abs(jnp.diag(matrix)))
+    size = jnp.where(size > 0, size, 1)
+    scale = size[:, None] * size[None]
+    if not len(matrix):
+        return matrix
+    values, vectors = jnp.linalg.eigh(matrix / scale)
+    values = jnp.where(values > _DETERMINED, values, jnp.inf)
+    return matmul(vectors / values[None], vectors.T) / scale
 
 
 def worst_case(

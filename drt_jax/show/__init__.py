@@ -37,3 +37,4 @@ from .more import more_panels as more_panels
 from .page import page as page
 from .prescription import prescription as prescription
 from .sheet import panels as panels, sheet as sheet
+from .tolerances import sensitivity as sensitivity, yields as yields

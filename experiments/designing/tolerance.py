@@ -3,7 +3,8 @@
 Every lens is compensated, by focus or focus and tilt. A spot is the root mean square over the
 fields of the RMS radius of all wavelengths about their centroid, um. Writes results.json: `rows`,
 one for each error, with its `kind`, `place`, `size`, the change of the spot at minus and plus this
-size as predicted from second derivatives (`predicted_um`) and as traced (`traced_um`), and the
+size as predicted from second derivatives (`predicted_um`) and as traced (`traced_um`, and
+`before_um` without compensation), and the
 `moves` and `predicted_moves` of the compensators, mm and radians; `scales`, one for each scale of
 all sizes, with the spots of Monte Carlo and of each order of prediction; `worst`, the spot with all
 errors at the limits where second derivatives predict the largest. A lens with a failed ray has no
@@ -137,7 +138,7 @@ def derivatives(study: Study) -> dict[str, Any]:
         found = jax.block_until_ready(design.predict(problem, perturbed, config.compensator))
         seconds.append(time.perf_counter() - begun)
     return {
-        "fields": {name: np.asarray(array).tolist() for name, array in found._asdict().items()},
+        "fields": jax.tree.map(lambda array: np.asarray(array).tolist(), found),
         "derivatives_s": seconds[1],
         "derivatives_compile_s": seconds[0] - seconds[1],
         "rule_error": abs(spots[0] / spots[1] - 1),
@@ -149,34 +150,36 @@ def _um(squares: Any) -> np.ndarray:
     return 1e3 * np.sqrt(np.maximum(squares, 0))
 
 
+def _model(fields: list) -> design.Predicted:
+    """The model whose fields `derivatives` has listed."""
+    *arrays, before = fields
+    return design.Predicted(*map(jnp.asarray, arrays), before and _model(before))
+
+
 def sensitivity(study: Study, predicted: design.Predicted) -> dict[str, Any]:
     """Each error alone at both limits, and all errors at the worst limits."""
-    perturbed, count = study.perturbed, len(study.perturbed.deviations)
+    perturbed = study.perturbed
+    given = study.problem, perturbed, study.config.compensator
+    traced, foretold = (design.sensitivity(*given, model) for model in (None, predicted))
     worst = design.worst_case(perturbed, predicted)
-    perturbations = np.concatenate(
-        [-np.eye(count), np.eye(count), np.zeros((1, count)), worst[None]]
-    )
-    built = study.traced(perturbations, "one error")
-    spots = 1e3 * np.asarray(built.spot)
-    changes = _um(predicted.at(perturbations, "second")) - _um(predicted.nominal)
-    moves = np.asarray(predicted.moves) + perturbations @ np.asarray(predicted.move_slopes)
+    spot = float(study.traced(worst[None], "worst case").spot[0])
     variances = design.variances(perturbed, study.normal)
     share = np.diag(np.asarray(predicted.hessian)) * variances / 2
     rows = []
     for k, error in enumerate(perturbed.deviations):
-        pair = [k, count + k]
         rows.append({
             "error": str(error), "kind": error.kind, "place": error.place, "axis": error.axis,
             "size": float(perturbed.sizes[k]), "unit": KINDS[error.kind].unit,
-            "predicted_um": changes[pair].tolist(),
-            "traced_um": (spots[pair] - spots[-2]).tolist(),
-            "predicted_moves": (moves[pair] - moves[-2]).tolist(),
-            "moves": (built.moves[pair] - built.moves[-2]).tolist(),
+            "predicted_um": (1e3 * foretold.after[k]).tolist(),
+            "traced_um": (1e3 * traced.after[k]).tolist(),
+            "before_um": (1e3 * traced.before[k]).tolist(),
+            "predicted_moves": foretold.moves[k].tolist(),
+            "moves": traced.moves[k].tolist(),
             "growth_um2": 1e6 * float(share[k]),
         })  # fmt: skip
     orders = {order: float(_um(predicted.at(worst, order))) for order in _ORDERS}
-    worst_um = {"traced": float(spots[-1]), **orders}
-    return {"rows": rows, "nominal_um": float(spots[-2]), "worst": worst_um}
+    worst_um = {"traced": 1e3 * spot, **orders}
+    return {"rows": rows, "nominal_um": 1e3 * traced.nominal, "worst": worst_um}
 
 
 def monte_carlo(study: Study, predicted: design.Predicted, scale: float) -> dict[str, Any]:
@@ -226,8 +229,7 @@ def run(config: Config, run: Run) -> dict[str, Any]:
     """Derivatives, then each error alone, then Monte Carlo at each scale."""
     study = Study(config)
     (found,) = _common.measured(run, "step", {"derivatives": lambda: derivatives(study)})
-    arrays = {name: jnp.asarray(array) for name, array in found.pop("fields").items()}
-    given = study, design.Predicted(**arrays)
+    given = study, _model(found.pop("fields"))
     jobs: dict[str, Any] = {"one error": lambda: sensitivity(*given)}
     for scale in config.scales:
         jobs[f"sizes x {scale:g}"] = functools.partial(monte_carlo, *given, scale)

@@ -1,0 +1,249 @@
+"""Sensitivity of a lens to each error alone, as a table; and the errors that keep a drop."""
+
+import csv
+import dataclasses
+import os
+from typing import NamedTuple
+
+import numpy as np
+
+from ..inputs import require
+from ..numerics import Numbers
+from .assembly import Assembly, Given
+from .perturbed import KINDS, Deviation, PerturbedLens
+from .problem import Problem
+from .tolerance import Predicted, monte_carlo
+
+# Operands in units other than mm or none: a factor and the unit in which a table shows them.
+_UNITS = {
+    **dict.fromkeys(("spot", "spot_of_colours", "spot_chief", "rms_spot"), (1e3, "um")),
+    **dict.fromkeys(("centroid", "lateral_colour"), (1e3, "um")),
+    **dict.fromkeys(("path_difference", "rms_wavefront"), (1.0, "waves")),
+    "distortion": (100.0, "%"),
+    "chief_ray_angle": (180 / np.pi, "deg"),
+}
+_AT = {"mtf": " at {:g} cycles/mm", "encircled_energy": " within {:g} mm"}
+_FOCUS = (("sensor", "mm"), ("sensor tilt x", "rad"), ("sensor tilt -y", "rad"))
+_TRIALS = 5  # of each size by rays, after the parabola
+_GRID = 400  # sizes at which the parabola is looked at
+_STEEPEST = 0.5, 4.0  # powers of the size with which a drop grows, at least and at most
+
+
+class Sensitivity(NamedTuple):
+    """What each error alone does to the criterion of an `Assembly`; prints as a table.
+
+    criterion: name of the criterion.
+    unit, factor: unit in which the table shows the criterion, and the factor from its own unit.
+    nominal: the criterion without errors.
+    target: of the criterion; good is what is near it.
+    deviations: the P errors.
+    sizes: (P,), in the units of `Tolerance`.
+    before: (P, 2), change of the criterion at minus and plus the size, with all adjustments held.
+    after: (P, 2), change after compensation; infinite where rays fail.
+    moves: (P, 2, C), changes of the adjustments.
+    adjustments: C pairs of a name and a unit.
+    by: "rays" for traced lenses, "second derivatives" for a prediction.
+    """
+
+    criterion: str
+    unit: str
+    factor: float
+    nominal: float
+    target: float
+    deviations: tuple[Deviation, ...]
+    sizes: np.ndarray
+    before: np.ndarray
+    after: np.ndarray
+    moves: np.ndarray
+    adjustments: tuple[tuple[str, str], ...]
+    by: str
+
+    @property
+    def growth(self) -> np.ndarray:
+        """By how much the worse sign of each error (P,) takes the criterion away from its target,
+        after compensation.
+        """
+        off = abs(self.nominal - self.target)
+        return np.max(np.abs(self.nominal + self.after - self.target) - off, axis=1)
+
+    def worst(self, count: int | None = None) -> "Sensitivity":
+        """The errors with the largest `growth`, largest first.
+
+        count: number of errors; None for all.
+        """
+        order = np.argsort(-self.growth, kind="stable")[:count]
+        arrays = {
+            name: getattr(self, name)[order] for name in ("sizes", "before", "after", "moves")
+        }
+        return self._replace(deviations=tuple(self.deviations[k] for k in order), **arrays)
+
+    def rows(self) -> list[list[str]]:
+        """The table, worst error first: a line of headings, and a line for each error."""
+        some, unit = self.worst(), f" ({self.unit})" if self.unit else ""
+        changes = (f"{when} {sign}{unit}" for when in ("before", "after") for sign in "-+")
+        moved = (f"{name} ({unit})" for name, unit in self.adjustments)
+        rows = [["error", "size", *changes, *moved]]
+        for k, deviation in enumerate(some.deviations):
+            size = f"{some.sizes[k]:.4g} {KINDS[deviation.kind].unit}".strip()
+            both = self.factor * np.concatenate([some.before[k], some.after[k]])
+            words = (f"{change:+.4g}" if np.isfinite(change) else "fails" for change in both)
+            most = (f"{move:.3g}" for move in np.max(np.abs(some.moves[k]), axis=0, initial=0))
+            rows.append([str(deviation), size, *words, *most])
+        return rows
+
+    def csv(self, path: str | os.PathLike) -> None:
+        """Writes the table as comma-separated values.
+
+        path: of the file.
+        """
+        with open(path, "w", newline="", encoding="utf-8") as file:
+            csv.writer(file).writerows(self.rows())
+
+    def __str__(self) -> str:
+        nominal = f"{self.factor * self.nominal:.4g} {self.unit}".strip()
+        rows = self.rows()
+        widths = [max(map(len, column)) for column in zip(*rows)]
+        first = f"{self.criterion}: {nominal} without errors; changes by {self.by}"
+        lines = (
+            "  ".join([row[0].ljust(widths[0]), *map(str.rjust, row[1:], widths[1:])])
+            for row in rows
+        )
+        return "\n".join([first, *lines])
+
+
+def sensitivity(
+    problem: Problem,
+    perturbed: PerturbedLens,
+    compensator: Given = "focus",
+    predicted: Predicted | None = None,
+) -> Sensitivity:
+    """What each error alone does, at its largest in both directions.
+
+    problem: gives the fields, wavelengths and pupil rule.
+    perturbed: the lens and its errors.
+    compensator: as in `as_built`; an `Assembly` has another criterion than spots.
+    predicted: what `predict` has found with the same arguments: the table is then that of second
+        derivatives, and nothing is traced.
+
+    ValueError as in `as_built`.
+    """
+    assembly = Assembly.of(compensator).placed(problem, perturbed.lens, perturbed.beam_radius)
+    count = len(perturbed.deviations)
+    ends = np.concatenate([-np.eye(count), np.eye(count), np.zeros((1, count))])
+    if predicted is None:
+        built = monte_carlo(problem, perturbed, ends, assembly)
+        moves = np.asarray(built.moves)
+        values = held = np.asarray(built.value)
+        if moves.shape[1]:
+            fixed = dataclasses.replace(assembly, held=built.moves[-1])
+            held = np.asarray(monte_carlo(problem, perturbed, ends, fixed).value)
+    else:
+        both = [predicted, predicted.before or predicted]
+        values, held = (np.asarray(assembly.value(m.at(ends, "second"))) for m in both)
+        moves = ends @ np.asarray(predicted.move_slopes)
+    figure, parts = assembly.figure, assembly.parts
+    factor, unit = _UNITS.get(figure.name, (1.0, ""))
+    named = _FOCUS[: moves.shape[1]]
+    if parts is not None:
+        named = tuple((str(one), KINDS[one.kind].unit) for one in parts.deviations)
+    values, held, moves = (np.asarray(array, float) for array in (values, held, moves))
+    pairs = (np.stack([a[:count], a[count : 2 * count]], axis=1) for a in (held, values))
+    before, after = (pair - values[-1] for pair in pairs)
+    shifts = moves - moves[-1]
+    return Sensitivity(
+        figure.name.replace("_", " ") + _AT.get(figure.name, "").format(figure.at),
+        unit,
+        factor,
+        float(values[-1]),
+        0.0 if assembly.of_squares else float(figure.target),
+        perturbed.deviations,
+        np.asarray(perturbed.sizes, float),
+        before,
+        after,
+        np.stack([shifts[:count], shifts[count : 2 * count]], axis=1),
+        named,
+        "rays" if predicted is None else "second derivatives",
+    )
+
+
+def inverse_sensitivity(
+    problem: Problem,
+    perturbed: PerturbedLens,
+    compensator: Given,
+    drop: float,
+    most: float = 10.0,
+) -> PerturbedLens:
+    """The lens with errors of other sizes: each alone takes the criterion by `drop` from its
+    target.
+
+    A parabola through three traced lenses gives the size of each error, in the worse direction; a
+    few traced lenses correct it. Components x and y of one part get the smaller size. Read the
+    result by `sensitivity`. For a budget of N parts that add as a root sum of squares, ask for the
+    whole drop divided by N ** 0.5.
+
+    problem, perturbed, compensator: as in `sensitivity`.
+    drop: allowed change of the criterion after compensation, above 0, in its own unit (mm for
+        spots).
+    most: largest factor of the sizes that are given. An error that does less than the drop gets
+        these.
+
+    ValueError as in `as_built`, and for a drop or a factor that is not above 0.
+    """
+    require(0 < drop < np.inf, f"drop: must be above 0 and finite, got {drop:g}")
+    require(0 < most < np.inf, f"most: must be above 0 and finite, got {most:g}")
+    assembly = Assembly.of(compensator).placed(problem, perturbed.lens, perturbed.beam_radius)
+    signs, count = np.array([-1.0, 1.0]), len(perturbed.deviations)
+    bounds = [KINDS[deviation.kind].most for deviation in perturbed.deviations]
+    top = np.minimum(most, 0.99 * np.array(bounds) / np.asarray(perturbed.sizes))[:, None]
+
+    def growths(sizes: np.ndarray) -> np.ndarray:
+        """Loss beyond that without errors (P, 2), at sizes (P, 2) to both sides."""
+        rows = [np.diag(side) for side in (signs * sizes).T]
+        built = monte_carlo(problem, perturbed, np.concatenate([*rows, zero]), assembly)
+        loss = np.asarray(assembly.loss(built.value))
+        return (loss[:-1] - loss[-1]).reshape(2, count).T
+
+    zero = np.zeros((1, count))
+    size = np.minimum(np.ones((count, 2)), top)
+    low, high = np.zeros_like(size), np.broadcast_to(top, size.shape)
+    old, fell = size, growths(size)
+    # The drop is a t + b t^2 for an error of the size t, with the sign of a to one side.
+    slope, bend = (fell[:, 1] - fell[:, 0]) / 2, (fell[:, 1] + fell[:, 0]) / 2
+    t = top * np.geomspace(1e-4, 1, _GRID)
+    size = np.empty_like(old)
+    for side, sign in enumerate(signs):
+        part = t / old[:, :1]
+        reached = sign * slope[:, None] * part + bend[:, None] * part**2 >= drop
+        first = np.argmax(reached, axis=1)
+        size[:, side] = np.where(reached.any(axis=1), t[np.arange(count), first], top[:, 0])
+    for _ in range(_TRIALS):
+        found = growths(size)
+        low = np.where(found < drop, np.maximum(low, size), low)
+        high = np.where(found >= drop, np.minimum(high, size), high)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            power = np.log(found / fell) / np.log(size / old)
+            power = np.clip(np.where(np.isfinite(power), power, 1.0), *_STEEPEST)
+            new = size * (drop / np.maximum(found, 1e-3 * drop)) ** (1 / power)
+        middle = np.where(low > 0, np.sqrt(low * high), high / 4)
+        inside = (new > low) & (new < high) & np.isfinite(found)
+        old, fell = size, found
+        size = np.where(found == drop, size, np.where(inside, new, middle))
+        size = np.where(low >= top, top, size)
+    least = np.min(size, axis=1)
+    for part in perturbed.parts:
+        least[part] = np.min(least[part])
+    return dataclasses.replace(
+        perturbed, sizes=perturbed.sizes * least.astype(perturbed.sizes.dtype)
+    )
+
+
+def yields(values: np.ndarray, levels: Numbers, compensator: Given = "focus") -> np.ndarray:
+    """Fractions (L,) of lenses as built that are as good as each level, or better.
+
+    values: (K,), criterion of lenses, as `monte_carlo` returns it.
+    levels: (L,), in the unit of the criterion.
+    compensator: the `Assembly` of the lenses, which has the criterion.
+    """
+    loss = Assembly.of(compensator).loss
+    allowed = np.asarray(loss(np.asarray(levels, float)))
+    return np.mean(np.asarray(loss(np.asarray(values)))[:, None] <= allowed[None], axis=0)
