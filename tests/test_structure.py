@@ -47,7 +47,7 @@ ALLOWED_ALL = {"learn.__init__", "show.layout", "show.analyses", "show.sheet", "
 ROOMS = {
     "drt_jax": 554,
     "drt_jax/check": 298,
-    "drt_jax/design": 2498,
+    "drt_jax/design": 2719,
     "drt_jax/files": 2928,
     "drt_jax/image": 3041,
     "drt_jax/learn": 656,
