@@ -48,7 +48,7 @@ ROOMS = {
     "drt_jax": 554,
     "drt_jax/check": 298,
     "drt_jax/design": 2719,
-    "drt_jax/files": 2928,
+    "drt_jax/files": 3015,
     "drt_jax/image": 3041,
     "drt_jax/learn": 656,
     "drt_jax/lens": 1478,
