@@ -4,6 +4,7 @@ from . import least_squares as least_squares
 from .compensation import AsBuilt as AsBuilt, as_built as as_built
 from .configurations import Configurations as Configurations, configured as configured
 from .field_rays import FieldRays as FieldRays
+from .focusing import Focusing as Focusing, focusing as focusing
 from .glasses import (
     Snap as Snap,
     Snapped as Snapped,

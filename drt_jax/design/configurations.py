@@ -23,7 +23,7 @@ from ..rays.solve import Solver
 from .least_squares import Evaluation
 from .limits import Limit
 from .parts import PARTS, Place, places_of, with_arrays, with_numbers
-from .problem import Problem, weights_of
+from .problem import Problem, weights_of, with_apertures
 from .variables import Variables
 
 # Shared numbers count as equal if they differ by at most this, relative to number and scale.
@@ -202,9 +202,19 @@ class Configurations:
         """Number, problem and index of each configuration, in their order."""
         return sorted((e for group in self.groups for e in group.each()), key=lambda e: e[0])
 
-    def lenses(self, vector: Array) -> tuple[Lens, ...]:
+    def lenses(self, vector: Numbers) -> tuple[Lens, ...]:
         """The lens of each configuration at a vector (N,), with ties and solves applied."""
-        return tuple(problem.variables.lens_of(vector[own]) for _, problem, own in self._each())
+        y = jnp.asarray(vector)
+        return tuple(problem.variables.lens_of(y[own]) for _, problem, own in self._each())
+
+    def fitted(self, vector: Numbers, margin: float = 0.01) -> tuple[Lens, ...]:
+        """The lenses at a vector (N,) with common semi-diameters that just pass all rays of all
+        configurations, see `fit_apertures`; each stop keeps its own."""
+        lenses = self.lenses(vector)
+        pairs = zip(self.problems, lenses, strict=True)
+        wide = jnp.max(jnp.stack([problem.beam_radius(lens) for problem, lens in pairs]), axis=0)
+        wide = jnp.append((1 + margin) * wide, jnp.inf)
+        return tuple(with_apertures(lens, wide) for lens in lenses)
 
     def evaluate_each(self, vector: Array) -> list[Evaluation]:
         """The evaluation of each configuration at a vector (N,), without the weights.

@@ -308,7 +308,7 @@ def open_apertures(lens: Lens) -> Lens:
 
     lens: the lens. Its `apertures` are not changed.
     """
-    return _with_apertures(lens, jnp.full_like(lens.semi_diameter, jnp.inf))
+    return with_apertures(lens, jnp.full_like(lens.semi_diameter, jnp.inf))
 
 
 def fit_apertures(problem: Problem, lens: Lens, margin: float = 0.01) -> Lens:
@@ -320,10 +320,10 @@ def fit_apertures(problem: Problem, lens: Lens, margin: float = 0.01) -> Lens:
     lens: a lens with open apertures, see `open_apertures`.
     margin: relative increase of the semi-diameters.
     """
-    return _with_apertures(lens, jnp.append((1 + margin) * problem.beam_radius(lens), jnp.inf))
+    return with_apertures(lens, jnp.append((1 + margin) * problem.beam_radius(lens), jnp.inf))
 
 
-def _with_apertures(lens: Lens, semi_diameter: Array) -> Lens:
+def with_apertures(lens: Lens, semi_diameter: Array) -> Lens:
     """The lens with other semi-diameters (S + 1,), except for the stop."""
     own = lens.semi_diameter[lens.stop]
     return dataclasses.replace(lens, semi_diameter=semi_diameter.at[lens.stop].set(own))
