@@ -312,9 +312,10 @@ def _slots(
 ) -> tuple[list[np.ndarray], dict[str, int]]:
     """Where the variables of each problem stand in the vector, and the names of the vector."""
     sets = [problem.variables.places for problem in problems]
-    is_own = lambda place: bool({str(place), place.kind}.intersection(own))  # noqa: E731
+    words = {own} if isinstance(own, str) else {*own}
+    is_own = lambda place: bool({str(place), place.kind} & words)  # noqa: E731
     known = {word for places in sets for place in places for word in (str(place), place.kind)}
-    for name in [own] if isinstance(own, str) else own:
+    for name in sorted(words):
         some = ", ".join(sorted(str(place) for place in sets[0]))
         require(name in known, f"own: no variable is named {name!r}; there are {some}")
     shared = [place for place in sets[0] if not is_own(place)]

@@ -127,7 +127,7 @@ def run(config: Config, run: Run) -> dict[str, Any]:
         "designed": run.once("designed", lambda: searched(config, zoom, run, "designed")),
     }
     begin = zoom.variables.start
-    end = zoom.fitted(jnp.asarray(ends["designed"]["vector"]))
+    end = zoom.fitted(ends["designed"]["vector"], margin=1e-3)
     lenses = {"start": [system.lens for system in systems], "designed": end}
     rows: list[dict[str, Any]] = [{"configuration": k} for k in count]
     merits = {"start": zoom.merits(begin).tolist(), "moved": ends["moved"]["merits"]}

@@ -202,6 +202,7 @@ def other(**changed):
 
 REFUSED = {
     "own: no variable is named 'thickness 9'": ([{}, {}], ["thickness 9"]),
+    "own: no variable is named 'conic'": ([{}, {}], "conic"),
     "do not both vary conic 0": ([{}, {"vary": ["curvature", Vary("conic", (0,))]}], []),
     "sensor is shared, but begins at 42": (
         [{"vary": ["sensor"]}, {"vary": ["sensor"], "lens": configured(
