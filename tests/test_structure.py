@@ -47,7 +47,7 @@ ALLOWED_ALL = {"learn.__init__", "show.layout", "show.analyses", "show.sheet", "
 ROOMS = {
     "drt_jax": 554,
     "drt_jax/check": 298,
-    "drt_jax/design": 2755,
+    "drt_jax/design": 2756,
     "drt_jax/files": 3015,
     "drt_jax/image": 3043,
     "drt_jax/learn": 656,

@@ -63,7 +63,7 @@ YFIE 2 2 4 0 0
 def test_a_zoom_is_optimised_in_both_positions(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(ROOT)
     (tmp_path / "toy.zmx").write_text(TOY)
-    few = [f"lens={tmp_path / 'toy.zmx'}", "order=2", "trials=8", "tolerance=0.1"]
+    few = [f"lens={tmp_path / 'toy.zmx'}", "order=2", "trials=60", "tolerance=0.1"]
     few += ["moving=[{kind: thickness, surfaces: [1], low: 1}, {kind: sensor}]"]
     few += ["shared=[{kind: curvature}]", "operands=[{kind: spot}, {kind: air_edge, low: 0.1}]"]
     few += ["keep=[{kind: effective_focal_length, per_cent: 2}]"]
