@@ -115,6 +115,19 @@ def test_lenses_share_all_but_their_own():
         np.testing.assert_allclose(lens.sensor, again.sensor, rtol=1e-13)
 
 
+def test_a_group_moves_between_two_that_stand():
+    """A tie with a gap that each configuration has of its own."""
+    made = []
+    for lens in configured(load_lens("cooke_triplet"), {"thickness 1": (6.0, 5.0)}):
+        tie = Tie((1, 3), "opposite", "thickness", shift=10.5)
+        variables = Variables.from_lens(lens, [Vary("thickness", (1,)), "curvature"], [tie])
+        made.append(Problem.from_variables(variables, [Operand("effective_focal_length", 50.0)]))
+    joined = Configurations.from_problems(made, "thickness 1")
+    lenses = joined.lenses(joined.variables.start)
+    np.testing.assert_allclose([lens.thickness[1] for lens in lenses], [6, 5], rtol=1e-14)
+    np.testing.assert_allclose([lens.thickness[3] for lens in lenses], [4.5, 5.5], rtol=1e-14)
+
+
 def test_limits_name_their_configuration():
     y, all_of = evaluated()
     _, _, found = all_of(y)
