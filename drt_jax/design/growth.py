@@ -8,9 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from .configurations import AnyProblem, Configurations
 from .least_squares import Search
 from .optimum import Optimum, optimise
-from .problem import Problem
 from .solves import Solve
 
 # Smallest step to the next part, and the factor by which the step grows after a success.
@@ -44,7 +44,7 @@ class Growth(NamedTuple):
         return self.done >= 1 or self.step < SHORTEST
 
 
-def part_of(problem: Problem, part: Array | float) -> Problem:
+def part_of(problem: AnyProblem, part: Array | float) -> AnyProblem:
     """The problem for a part of its fields and aperture.
 
     Only numbers differ, so that one compiled program serves all parts.
@@ -53,6 +53,8 @@ def part_of(problem: Problem, part: Array | float) -> Problem:
     part: factor of the fields; and of the aperture: of the entrance pupil or f-number of a solve,
         if there is one, else of the stop.
     """
+    if isinstance(problem, Configurations):
+        return problem.map(lambda one: part_of(one, part))
 
     def own(solve: Solve) -> Solve:
         if not solve.aperture:
@@ -70,7 +72,7 @@ def part_of(problem: Problem, part: Array | float) -> Problem:
     return dataclasses.replace(problem, variables=variables, fields=problem.fields * part)
 
 
-def start_growth(problem: Problem, first: float = 0.3, step: float = 0.1) -> Growth:
+def start_growth(problem: AnyProblem, first: float = 0.3, step: float = 0.1) -> Growth:
     """The state before the first search.
 
     first: part to begin with.
@@ -80,7 +82,7 @@ def start_growth(problem: Problem, first: float = 0.3, step: float = 0.1) -> Gro
 
 
 def grow_once(
-    problem: Problem,
+    problem: AnyProblem,
     growth: Growth,
     target_merit: float,
     max_steps: int = 40,
@@ -110,7 +112,7 @@ def grow_once(
 
 
 def grow(
-    problem: Problem,
+    problem: AnyProblem,
     target_merit: float,
     first: float = 0.3,
     step: float = 0.1,

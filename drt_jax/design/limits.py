@@ -1,17 +1,21 @@
 """Limits by name: the value of an operand, and by how much it violates its limit."""
 
 import itertools
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Literal, NamedTuple
 
 import numpy as np
 
+from ..inputs import require
 from ..lens.lens import Lens
+from ..numerics import Numbers
 from .media import ZONES
 from .operands import Operand
-from .values import kind_of
+from .values import OPERANDS, kind_of
 
 _Side = Literal["low", "high"]
+# No variable moves a limit if none of them would meet it by a change of `_FAR` times its scale.
+_FAR = 1e6
 
 
 class Limit(NamedTuple):
@@ -64,6 +68,30 @@ def limits_of(
                 beyond = float(constraints[len(found)]) / weight
                 found.append(Limit(operand.name, where, side, bound, beyond))
     return found
+
+
+def refuse_fixed(
+    limits: Callable[[Numbers], list[Limit]], constraints: Numbers, slopes: Numbers
+) -> None:
+    """Raises ValueError for a limit that is exceeded and that no variable moves.
+
+    Its row of the Jacobian is 0 to rounding. Limits on rays are left out, because the violation by
+    a failed ray does not change until the ray passes.
+
+    limits: the limits by name of constraints, such as `Problem.limits`.
+    constraints: (L,), constraints at a vector.
+    slopes: (L, N), their derivatives there.
+    """
+    excess = np.asarray(constraints)
+    steepest = np.max(np.abs(np.asarray(slopes)), axis=1, initial=0)
+    fixed = (excess > 0) & np.isfinite(excess) & (steepest * _FAR < excess)
+    for limit, is_fixed in zip(limits(excess) if fixed.any() else [], fixed):
+        of_rays = limit.kind not in OPERANDS or "fields" in OPERANDS[limit.kind].names
+        require(
+            of_rays or not is_fixed,
+            f"operands: {limit}, and no variable moves it; leave this limit out, widen it, or vary "
+            "what it depends on",
+        )
 
 
 def _names(operand: Operand, lens: Lens, counts: dict[str, int], size: int) -> list[str]:

@@ -13,9 +13,10 @@ from ..compilation import LARGE, jit
 from ..inputs import require
 from ..lens.lens import Lens
 from ..numerics import concrete
+from ..rays.solve import solve_aimed
+from .configurations import AnyProblem, SharedVariables
 from .least_squares import Search, init, promised_gain, step
-from .limits import Limit
-from .problem import Problem, quick
+from .limits import Limit, refuse_fixed
 from .variables import Variables
 
 # Violations of at most `_NEAR` that remain at the end are removed in at most `_MENDING` more steps,
@@ -31,7 +32,7 @@ Ended = Literal["converged", "target", "steps", "limits", "stuck"]
 class Optimum(NamedTuple):
     """Result of an optimisation.
 
-    lens: the best lens.
+    lens: the best lens; of several configurations the first, see `Configurations.lenses`.
     vector: (N,), its vector.
     merit: sum of the squares of the residuals.
     score: merit plus the squares of the violations of limits.
@@ -57,7 +58,7 @@ class Optimum(NamedTuple):
     history: np.ndarray
     seconds: float
     first: float
-    variables: Variables
+    variables: Variables | SharedVariables
 
     def __str__(self) -> str:
         """Ten lines or so: merit, why it ended, limits that are active or violated, variables with
@@ -90,12 +91,12 @@ class Optimum(NamedTuple):
 
 
 @jax.jit
-def init_problem(problem: Problem, vector: Array) -> Search:
+def init_problem(problem: AnyProblem, vector: Array) -> Search:
     """The state of a search before the first step from a vector (N,) of the variables."""
     return init(problem.evaluate, vector)
 
 
-def step_problem(problem: Problem, search: Search) -> Search:
+def step_problem(problem: AnyProblem, search: Search) -> Search:
     """One trial of a search for a problem; none if the search is done."""
     return step(problem.evaluate, search, problem.variables.low, problem.variables.high)
 
@@ -108,7 +109,9 @@ def _again(search: Search) -> Search:
     return search._replace(stale=jnp.bool_(True), done=jnp.bool_(False))
 
 
-def _with_full_search(problem: Problem, tried: Problem, search: Search) -> tuple[Problem, Search]:
+def _with_full_search(
+    problem: AnyProblem, tried: AnyProblem, search: Search
+) -> tuple[AnyProblem, Search]:
     """The problem and the search to continue with.
 
     `tried` is the problem whose rays are only aimed. If the full ray search of `problem` finds more
@@ -121,7 +124,7 @@ def _with_full_search(problem: Problem, tried: Problem, search: Search) -> tuple
     return problem, take_step(problem, _again(search))
 
 
-def _mended(problem: Problem, search: Search) -> Search:
+def _mended(problem: AnyProblem, search: Search) -> Search:
     """Continues a search with stiff constraints until all limits are met.
 
     Returns that search, or the original one if the limits are not met within 20 steps.
@@ -138,7 +141,7 @@ def _mended(problem: Problem, search: Search) -> Search:
     return search
 
 
-def _why(problem: Problem, search: Search, target_merit: float) -> Ended:
+def _why(problem: AnyProblem, search: Search, target_merit: float) -> Ended:
     """Why a search ended, see `Optimum.ended`."""
     if target_merit and float(search.score) <= target_merit:
         return "target"
@@ -151,7 +154,7 @@ def _why(problem: Problem, search: Search, target_merit: float) -> Ended:
 
 
 def optimise(
-    problem: Problem,
+    problem: AnyProblem,
     vector: Array | None = None,
     max_steps: int = 500,
     callback: Callable[[Search], None] = lambda search: None,
@@ -162,7 +165,7 @@ def optimise(
     Read `Optimum.converged` and `Optimum.ended`. Small violations of limits that remain at the end
     are removed by a few more steps.
 
-    problem: the design problem.
+    problem: the design problem, of one configuration or of several.
     vector: (N,), start of the variables; None for that of the problem.
     max_steps: largest number of trials.
     callback: called with the search after each trial.
@@ -177,7 +180,7 @@ def optimise(
         "optimise: call it outside of jax.jit; inside, use least_squares.init and step",
     )
     start = problem.variables.start if vector is None else jnp.asarray(vector)
-    tried, history = quick(problem), list[list[Array]]()
+    tried, history = problem.with_solver(solve_aimed), list[list[Array]]()
     search = init_problem(tried, jnp.clip(start, problem.variables.low, problem.variables.high))
     begun = compiled = time.perf_counter()
     for _ in range(max(max_steps, 1)):
@@ -185,7 +188,7 @@ def optimise(
         if not history:
             compiled = time.perf_counter()
             slopes = np.asarray(search.jacobian)[search.evaluation.residuals.size :]
-            tried.refuse_fixed(search.evaluation.constraints, slopes)
+            refuse_fixed(tried.limits, search.evaluation.constraints, slopes)
         before = history[-1][2] if history else 0
         history.append([search.merit, search.max_violation, search.jacobians])
         callback(search)

@@ -21,23 +21,21 @@ from ..rays.solve import Solver, solve, solve_aimed
 from .failures import failures
 from .field_rays import FieldRays, beam_radius, symmetry_by_structure, trace_views
 from .least_squares import Evaluation
-from .limits import Limit, limits_of
+from .limits import Limit, limits_of, refuse_fixed
 from .media import gaps
 from .operands import Operand, OperandFunction, OperandName
-from .values import OPERANDS, kind_of
+from .values import kind_of
 from .variables import Variables
 from .waves import degree_of
 
 _OF_PATHS = "path_difference", "rms_wavefront"
 # Smallest penalty of a failed ray: it counts as a miss by this many semi-diameters of the stop.
 _FAILED = 4.0
-# No variable moves a limit if none of them would meet it by a change of `_FAR` times its scale.
-_FAR = 1e6
 # Smallest height of the marginal ray at the stop, relative to its largest height on any surface.
 _SLIMMEST = 0.1
 
 
-def _weights(what: str, given: Numbers, count: int) -> np.ndarray:
+def weights_of(what: str, given: Numbers, count: int) -> np.ndarray:
     """Weights (count,) with the mean 1. ValueError, which begins with `what`, for a wrong shape or
     value.
     """
@@ -127,10 +125,10 @@ class Problem:
             rule = Gauss(rule, symmetry if across else "none")
         if isinstance(rule, Clipped):  # trace no rays of weight 0
             rule = dataclasses.replace(rule, order=int(rule.order), size=0)
-        share = _weights("wavelength_weights", scene.spectrum, len(waves)) / len(waves)
+        share = weights_of("wavelength_weights", scene.spectrum, len(waves)) / len(waves)
         weights = scene.field_weights
         if weights is not None:
-            weights = jnp.asarray(_weights("field_weights", weights, len(angles)), dtype)
+            weights = jnp.asarray(weights_of("field_weights", weights, len(angles)), dtype)
         numbers = angles, far, waves, jnp.asarray(share, dtype)
         problem = cls(variables, *numbers, rule, asked, field_weights=weights)
         problem._check_operands()
@@ -191,6 +189,10 @@ class Problem:
             f"  rays of {self.rule}; {len(lines)} operands:",
         ]
         return "\n".join([*first, *lines[:6], *more])
+
+    def with_solver(self, solver: Solver) -> "Problem":
+        """The problem with another ray solver."""
+        return dataclasses.replace(self, solver=solver)
 
     def with_order(self, order: int) -> "Problem":
         """The problem with a Gauss rule of another order."""
@@ -268,28 +270,6 @@ class Problem:
             sizes = [a.size for a in jax.eval_shape(constraints_of_each, lens)]
         return limits_of(self.operands, lens, counts, sizes, np.asarray(constraints))
 
-    def refuse_fixed(self, constraints: Numbers, slopes: Numbers) -> None:
-        """Raises ValueError for a limit that is exceeded and that no variable moves.
-
-        Its row of the Jacobian is 0 to rounding. Limits on rays are left out, because the violation
-        by a failed ray does not change until the ray passes.
-
-        constraints: (L,), constraints at a vector.
-        slopes: (L, N), their derivatives there.
-        """
-        excess, steepest = (
-            np.asarray(constraints),
-            np.max(np.abs(np.asarray(slopes)), axis=1, initial=0),
-        )
-        fixed = (excess > 0) & np.isfinite(excess) & (steepest * _FAR < excess)
-        for limit, is_fixed in zip(self.limits(excess) if fixed.any() else [], fixed):
-            of_rays = limit.kind not in OPERANDS or "fields" in OPERANDS[limit.kind].names
-            require(
-                of_rays or not is_fixed,
-                f"operands: {limit}, and no variable moves it; leave this limit out, widen it, or "
-                "vary what it depends on",
-            )
-
     def _refuse_fixed(self) -> None:
         """Calls `refuse_fixed` for limits that need no rays."""
         without_rays = tuple(o for o in self.operands if o.limits and not kind_of(o.kind).traced)
@@ -297,7 +277,7 @@ class Problem:
             part, start = dataclasses.replace(self, operands=without_rays), self.variables.start
             excess = _exceeded(part, start)
             if np.any(excess > 0):
-                part.refuse_fixed(excess, _exceeded_slopes(part, start))
+                refuse_fixed(part.limits, excess, _exceeded_slopes(part, start))
 
     @jax.jit
     def beam_radius(self, lens: Lens) -> Array:
@@ -340,7 +320,7 @@ def quick(problem: Problem) -> Problem:
     """The problem with `solve_aimed` as its solver, a smaller program without the full ray
     search.
     """
-    return dataclasses.replace(problem, solver=solve_aimed)
+    return problem.with_solver(solve_aimed)
 
 
 def open_apertures(lens: Lens) -> Lens:
@@ -348,7 +328,7 @@ def open_apertures(lens: Lens) -> Lens:
 
     lens: the lens. Its `apertures` are not changed.
     """
-    return _with_apertures(lens, jnp.full_like(lens.semi_diameter, jnp.inf))
+    return with_apertures(lens, jnp.full_like(lens.semi_diameter, jnp.inf))
 
 
 def fit_apertures(problem: Problem, lens: Lens, margin: float = 0.01) -> Lens:
@@ -360,10 +340,10 @@ def fit_apertures(problem: Problem, lens: Lens, margin: float = 0.01) -> Lens:
     lens: a lens with open apertures, see `open_apertures`.
     margin: relative increase of the semi-diameters.
     """
-    return _with_apertures(lens, jnp.append((1 + margin) * problem.beam_radius(lens), jnp.inf))
+    return with_apertures(lens, jnp.append((1 + margin) * problem.beam_radius(lens), jnp.inf))
 
 
-def _with_apertures(lens: Lens, semi_diameter: Array) -> Lens:
+def with_apertures(lens: Lens, semi_diameter: Array) -> Lens:
     """The lens with other semi-diameters (S + 1,), except for the stop."""
     own = lens.semi_diameter[lens.stop]
     return dataclasses.replace(lens, semi_diameter=semi_diameter.at[lens.stop].set(own))

@@ -18,9 +18,11 @@ from ..compilation import LARGE, jit
 from ..devices import shared
 from ..inputs import require
 from ..numerics import Numbers
+from ..rays.solve import solve_aimed
+from .configurations import AnyProblem, Configurations, SharedVariables
 from .least_squares import Search
 from .optimum import init_problem, step_problem
-from .problem import Problem, quick, trace_fields
+from .problem import trace_fields
 from .tiles import in_tiles, tile_size
 from .variables import Variables
 
@@ -31,7 +33,9 @@ _TILE = 16
 _SAME_MERIT, _SAME_PLACE = 1e-3, 1.0
 
 
-def normal_starts(variables: Variables, count: int, spread: float, seed: int = 0) -> np.ndarray:
+def normal_starts(
+    variables: Variables | SharedVariables, count: int, spread: float, seed: int = 0
+) -> np.ndarray:
     """Starts around the lens, within the bounds: its own vector, then normally distributed vectors.
 
     variables: variables of the lens.
@@ -41,12 +45,12 @@ def normal_starts(variables: Variables, count: int, spread: float, seed: int = 0
 
     Returns (count, N).
     """
-    moves = np.random.default_rng(seed).normal(size=(count, len(variables.places)))
+    moves = np.random.default_rng(seed).normal(size=(count, len(variables.names)))
     moves[0] = 0
     return np.clip(np.asarray(variables.start) + spread * moves, variables.low, variables.high)
 
 
-def sobol_starts(variables: Variables, count: int, seed: int = 0) -> np.ndarray:
+def sobol_starts(variables: Variables | SharedVariables, count: int, seed: int = 0) -> np.ndarray:
     """Starts that are evenly distributed within the bounds (scrambled Sobol sequence).
 
     variables: variables, all with bounds. ValueError, which names it, for a variable without
@@ -128,13 +132,13 @@ _begin = jax.jit(jax.vmap(init_problem, (None, 0)))
 
 
 @partial(jit, wanted=LARGE, static_argnames="mesh")
-def _advance(problem: Problem, steps: Array, searches: Search, mesh: Mesh | None) -> Search:
+def _advance(problem: AnyProblem, steps: Array, searches: Search, mesh: Mesh | None) -> Search:
     """Takes `steps` steps of a tile of searches. A device whose searches are all done takes
     fewer.
     """
     each = jax.vmap(step_problem, (None, 0))
 
-    def here(problem: Problem, steps: Array, searches: Search) -> Search:
+    def here(problem: AnyProblem, steps: Array, searches: Search) -> Search:
         def more(state: tuple[Array, Search]) -> Array:
             return (state[0] < steps) & ~jnp.all(state[1].done)
 
@@ -147,7 +151,7 @@ def _advance(problem: Problem, steps: Array, searches: Search, mesh: Mesh | None
 
 
 def many_starts(
-    problem: Problem,
+    problem: AnyProblem,
     starts: Numbers,
     steps: Sequence[int] = (12, 12, 24, 48, 200),
     survivors: float = 0.5,
@@ -175,18 +179,18 @@ def many_starts(
     """
     begun = time.perf_counter()
     vectors = np.asarray(starts, float)
-    width = len(problem.variables.places)
+    width = len(problem.variables.names)
     valid = vectors.ndim == 2 and vectors.shape[1] == width and len(vectors)
     require(valid, f"starts: expected (K, {width}), got shape {vectors.shape}")
     vectors = np.clip(vectors, problem.variables.low, problem.variables.high)
-    tried = quick(problem)
+    tried = problem.with_solver(solve_aimed)
     state = jax.tree.map(np.array, _begin(tried, jnp.asarray(vectors)))
     best: list[float] = []
 
     def rows(which: np.ndarray) -> Search:
         return jax.tree.map(lambda a: a[which], state)
 
-    def advance(problem: Problem, searches: np.ndarray, steps: int) -> Iterator[None]:
+    def advance(problem: AnyProblem, searches: np.ndarray, steps: int) -> Iterator[None]:
         """Advances searches in place; yields after each tile."""
         done, whole = 0, (problem, np.int32(steps))
         for part in in_tiles(_advance, whole, rows(searches), _TILE, threads, mesh):
@@ -228,8 +232,10 @@ def many_starts(
     )
 
 
-def rays_of(problem: Problem) -> int:
+def rays_of(problem: AnyProblem) -> int:
     """Number of rays that one evaluation of a problem traces."""
+    if isinstance(problem, Configurations):
+        return sum(map(rays_of, problem.problems))
     if not problem.traces:
         return 0
     rays = jax.eval_shape(lambda p: trace_fields(p, p.variables.lens).weights, problem)

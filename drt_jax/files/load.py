@@ -48,6 +48,8 @@ class System:
         `with_paraxial_pupil`. `chief` (CODE V): the chief ray at the centre of the stop, the others
         around it over an entrance pupil of paraxial width. Otherwise at the stop, as here.
     notes: features of the file that the lens lacks or that are read differently.
+    configurations: number of configurations (zoom positions) of the file. configuration: the one
+        that was read, from 1.
     """
 
     lens: Lens
@@ -64,6 +66,8 @@ class System:
     aperture_kind: ApertureKind | None
     ray_aiming: str = ""
     notes: tuple[str, ...] = ()
+    configurations: int = 1
+    configuration: int = 1
 
     @property
     def scene(self) -> Scene:
@@ -97,7 +101,11 @@ def lens_names() -> list[str]:
     return sorted(path.stem for path in _BUNDLED.glob("*.yaml"))
 
 
-def load_lens(source: str | pathlib.Path | Mapping, missing: Missing = "error") -> Lens:
+def load_lens(
+    source: str | pathlib.Path | Mapping,
+    missing: Missing = "error",
+    configuration: int | None = None,
+) -> Lens:
     """Read a lens.
 
     The arrays have JAX's default floating dtype: float64 if the caller enabled it. LensError, with
@@ -106,7 +114,7 @@ def load_lens(source: str | pathlib.Path | Mapping, missing: Missing = "error") 
     source: a bundled name (see `lens_names`), the path of a YAML prescription of at most 1 MB or
         of a Zemax `.zmx` or CODE V `.seq` file, see `load_system`, or a mapping with the keys of a
         prescription.
-    missing: see `load_system`.
+    missing, configuration: see `load_system`.
     """
     with jax.core.eval_context():  # a lens loaded inside a jitted function is a constant
         if isinstance(source, Mapping):
@@ -118,7 +126,7 @@ def load_lens(source: str | pathlib.Path | Mapping, missing: Missing = "error") 
         remedy = f"for a file of your own give a path that ends in {', '.join(_ENDINGS)}"
         require(path.suffix, f"{what}; {remedy}")
         if known_ending(path) in _READERS:
-            record = read_record(path, missing)
+            record = read_record(path, missing, configuration)
             lens = _lens_of(record)
             record.say()
             return lens
@@ -176,7 +184,9 @@ def _with_catalogues(top: Any, folder: pathlib.Path) -> Any:
     return rest | {"glasses": found | own if isinstance(own, dict) else own}
 
 
-def load_system(path: str | pathlib.Path, missing: Missing = "error") -> System:
+def load_system(
+    path: str | pathlib.Path, missing: Missing = "error", configuration: int | None = None
+) -> System:
     """Read a lens with its fields, wavelengths and aperture from a Zemax `.zmx` or CODE V
     `.seq` file of at most 16 MB; see docs/lens_files.md.
 
@@ -186,23 +196,30 @@ def load_system(path: str | pathlib.Path, missing: Missing = "error") -> System:
 
     missing: "error" refuses features that the package lacks; "warn" leaves them out, and lists
         them, if rays can be traced without them.
+    configuration: number of a configuration or zoom position, as in the file from 1; None for the
+        current one of a `.zmx` file, the first of a `.seq` file. `System.configurations` says how
+        many there are.
     """
     known = pathlib.Path(path).suffix.lower() in _READERS
     what = f"{path}: fields and wavelengths are read from {', '.join(_READERS)}; use load_lens"
     require(known, what)
     with jax.core.eval_context():
-        record = read_record(path, missing)
+        record = read_record(path, missing, configuration)
         lens = _lens_of(record)
         fields, own = _angles(record, lens), _of_system(record.use)
     record.say()
+    own |= {name: getattr(record, name) for name in ("configurations", "configuration")}
     return System(lens, record.distance, fields, notes=tuple(record.notes), **own)
 
 
-def read_record(path: str | pathlib.Path, missing: Missing = "error") -> Record:
+def read_record(
+    path: str | pathlib.Path, missing: Missing = "error", configuration: int | None = None
+) -> Record:
     """Read a file of another program."""
     require_one_of("missing", missing, ("error", "warn"))
     with naming(path):
-        return _READERS[pathlib.Path(path).suffix.lower()](str(path), missing, lines_of(path))
+        read = _READERS[pathlib.Path(path).suffix.lower()]
+        return read(str(path), missing, lines_of(path), configuration)
 
 
 def _lens_of(record: Record) -> Lens:

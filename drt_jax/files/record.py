@@ -74,6 +74,7 @@ class Record:
     distance: of the object, below 0 for a virtual one behind the first vertex. medium: keys of the
     object's medium. parts: surfaces and coordinate breaks in order; the image is the last surface.
     glasses: those that the file itself defines, as in a prescription. afocal: as in `Lens`.
+    configurations: their number. configuration: the one that is read, from 1.
     notes: what is left out or read differently from the file. solves: lines with solves. unknown:
     words that are not known, each with its line.
     """
@@ -90,6 +91,8 @@ class Record:
     notes: list[str] = dataclasses.field(default_factory=list)
     solves: list[int] = dataclasses.field(default_factory=list)
     unknown: dict[str, int] = dataclasses.field(default_factory=dict)
+    configurations: int = 1
+    configuration: int = 1
 
     def error(self, line: int, message: str) -> LensError:
         """An error about a line of the file; line 0: about the whole file."""
@@ -109,6 +112,16 @@ class Record:
     def note(self, line: int, message: str) -> None:
         """Add a note about a line."""
         self.notes.append(f"line {line}: {message}")
+
+    def choose(self, line: int, count: int, current: int, wanted: int | None) -> None:
+        """Set the configuration that is read: the wanted one, or the current one with a note.
+        LensError for a number that does not exist."""
+        self.configurations, self.configuration = count, current if wanted is None else wanted
+        some = f"the file has {count}, from 1" if count > 1 else "the file has one alone"
+        known = wanted is None or (isinstance(wanted, int) and 1 <= wanted <= count)
+        self.require(known, line, f"there is no configuration {wanted!r}; {some}")
+        if wanted is None and count > 1:
+            self.note(line, f"of {count} configurations number {current}; give `configuration`")
 
     def note_unread(self, what: str) -> None:
         """Notes of solves, and of words that are not known. what: kind of the words."""

@@ -45,11 +45,11 @@ class _Reader:
     lists, list_lines: numbers of fields and wavelengths by key, and the line of each key's last
     command. unit: of length, mm. radii: whether numbers of surfaces are radii, None until RDM says.
     complete: whether the image has come. stop: number of its surface, 0 until it is known. clips:
-    whether apertures are used.
+    whether apertures are used. wanted: the zoom position to read, see `load_system`.
     """
 
-    def __init__(self, path: str, missing: Missing):
-        self.record = Record(path, missing)
+    def __init__(self, path: str, missing: Missing, wanted: int | None):
+        self.record, self.wanted = Record(path, missing), wanted
         self.glasses = Glasses(self.record)
         self.lists: dict[str, list[float]] = {}
         self.list_lines: dict[str, int] = {}
@@ -124,22 +124,24 @@ def _return(reader: _Reader, command: Command) -> None:
 
 
 def _zoom(reader: _Reader, command: Command) -> None:
-    """`ZOO 3`, or a command with a value for each zoom position; the first value is used."""
+    """`ZOO 3`, or a command with a value for each zoom position."""
     record, line, words = reader.record, command.line, command.values
     if words and words[0].isdecimal():
-        if command.count() > 1:
-            record.note(line, f"of {words[0]} zoom positions the first")
+        record.choose(line, command.count(), 1, reader.wanted)
     elif words:
         own = command_of(record, line, words[0].upper()[:3], words[1:])
         known = own.key not in _LISTS or own.qualifiers
         own.require(known, f"ZOO {own.key}: name the field or the wavelength, as F1 or W1")
         if own.values:
-            _take(reader, dataclasses.replace(own, values=own.values[:1]))
+            at, count = record.configuration, len(own.values)
+            own.require(count in (1, record.configurations), f"ZOO {own.key}: {count} values")
+            value = own.values[at - 1 if count > 1 else 0]
+            _take(reader, dataclasses.replace(own, values=[value]))
 
 
 def _take(reader: _Reader, command: Command) -> None:
     """Execute a command from outside the private catalogue."""
-    if (zoom := command.of("Z")) and zoom[0] != "1":
+    if (zoom := command.of("Z")) and str(reader.record.configuration) not in zoom:
         return  # for another zoom position, see `_zoom`
     record, use, line = reader.record, reader.record.use, command.line
     first = command.values[0].upper() if command.values else ""
@@ -186,10 +188,12 @@ def _take(reader: _Reader, command: Command) -> None:
             record.unknown.setdefault(short(key), line)
 
 
-def read_seq(path: str, missing: Missing, lines: list[str]) -> Record:
+def read_seq(
+    path: str, missing: Missing, lines: list[str], configuration: int | None = None
+) -> Record:
     """Read the lines of a `.seq` file into a record of its surfaces and their use. LensError with
-    the line. path: its name in messages."""
-    reader, private, ended = _Reader(path, missing), False, False
+    the line. path: its name in messages. configuration: see `load_system`."""
+    reader, private, ended = _Reader(path, missing, configuration), False, False
     for own in commands_of(reader.record, lines):
         if ended:
             note = f"what follows the GO of the lens, from line {own.line} on, is not read"
@@ -220,6 +224,8 @@ def _finish(reader: _Reader) -> None:
     if not reader.stop:
         record.notes.append("no STO: the stop is surface 1")
     record.note_unread("commands")
+    if record.configurations == 1:
+        record.choose(0, 1, 1, reader.wanted)
     require(waves, 0, "no wavelength is given: WL, in nm")
     require(use.aperture_kind, 0, "no aperture is given: EPD, FNO, NA or NAO")
     surfaces[reader.stop or 1].put("stop", True)

@@ -21,6 +21,7 @@ from .record import (
     words_of,
 )
 from .specs import MEDIUM_KEYS, SURFACES
+from .zmx_configurations import choose
 from .zmx_surfaces import TYPES, Surface
 
 _UNITS = {"MM": 1.0, "CM": 10.0, "IN": 25.4, "M": 1000.0, "METER": 1000.0}
@@ -161,11 +162,14 @@ def _positive(record: Record, line: int, value: float) -> float:
     return value
 
 
-def read_zmx(path: str, missing: Missing, lines: list[str]) -> Record:
+def read_zmx(
+    path: str, missing: Missing, lines: list[str], configuration: int | None = None
+) -> Record:
     """Read the lines of a `.zmx` file into a record of its surfaces and their use. LensError with
-    the line. path: its name in messages."""
+    the line. path: its name in messages. configuration: see `load_system`."""
     record, surfaces, tail = Record(path, missing), list[Surface](), False
     head, found = Head(record), words_of(record, lines)
+    choose(record, found, configuration)
     whole = not any(words.key == "VERS" for words in found)
     indented = any(w.indented for w in found if w.key in ("TYPE", "CURV", "DISZ"))
     own: Head | Surface = head  # to which lines belong
@@ -183,9 +187,6 @@ def read_zmx(path: str, missing: Missing, lines: list[str]) -> Record:
             surfaces.append(own)
         elif words.key == "MNUM":
             tail = whole = True
-            if (count := words.count(0, 1)) > 1:
-                what = f"of {count} configurations number {words.count(1, 1)}"
-                record.note(words.line, what)
         elif not tail and own.take(words):
             continue
         elif surfaces and indented and not words.indented:

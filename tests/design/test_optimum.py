@@ -12,6 +12,7 @@ from scipy import optimize
 import drt_jax
 from drt_jax import Scene, design
 from drt_jax.design import Operand, Solve, Variables, Vary, least_squares
+from drt_jax.design.limits import refuse_fixed
 from drt_jax.design.starts import distinct
 
 # Of the singlet of issue 14, by another program: merit at the start and at the optimum, mm^2.
@@ -264,7 +265,7 @@ def test_a_limit_that_nothing_moves_is_refused(triplet):
     bounded = design.Problem.from_variables(
         bent, ["spot", Operand("distortion", low=-0.05)], Scene.radians(0.3, wavelengths=0.5876)
     )
-    bounded.refuse_fixed([0.95], [[0.0]])
+    refuse_fixed(bounded.limits, [0.95], [[0.0]])
 
 
 @pytest.mark.slow

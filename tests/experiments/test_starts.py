@@ -71,7 +71,7 @@ STARTS = {
 # Programs of many kinds.
 LONG = ("benchmark", "elements", "faults", "files", "images", "joint", "skips", "stability")
 # Those that tests of their own start, in `test_NAME`.
-ELSEWHERE = ("accuracy", "design", "render", "tolerance")
+ELSEWHERE = ("accuracy", "design", "render", "tolerance", "zoom")
 
 
 def runnable():

@@ -29,9 +29,9 @@ def written(folder, *lines, **others):
     return path
 
 
-def record(folder, *lines, missing="error", **others):
+def record(folder, *lines, missing="error", configuration=None, **others):
     """What is read, without a lens of it."""
-    return read_record(written(folder, *lines, **others), missing)
+    return read_record(written(folder, *lines, **others), missing, configuration)
 
 
 def entry(folder, *lines, at=0, **others):
@@ -404,7 +404,7 @@ def test_listed_double_gauss(tmp_path):
 
 
 def test_later_changes_solves_and_zooms(tmp_path):
-    """Of a named surface or several, also by its line again; of zoom positions the first."""
+    """Of a named surface or several, also by its line again; of zoom positions one."""
     later = ["THI S1 5; CUY S2 -.03; THI S2 PIM", "GLA S1 F2", "S1 40 6"]
     found = record(tmp_path, FRONT, BACK, *later)
     rows = found.parts
@@ -412,10 +412,25 @@ def test_later_changes_solves_and_zooms(tmp_path):
     assert [row.entry["curvature"] for row in rows] == [1 / 40, -0.03, 0]
     assert rows[0].entry["glass"] == "F2" and "line 11: solves" in found.notes[0]
     zoom = ["ZOO 3", "ZOO THI S1 7 8 9", "ZOO THC S1 0 0 0", "ZOO YAN F2 3 4 5", "EPD Z2 40"]
-    found = record(tmp_path, FRONT, BACK, *zoom)
-    assert found.parts[0].thickness == 7 and found.use.aperture == 10
-    assert found.use.heights[1] == (0, 3)
-    assert found.notes == ["line 11: of 3 zoom positions the first"]
+    zoom += ["ZOO THI S2 44", "THI S1 Z3 6"]
+    for wanted, gap, pupil, angle in (
+        (None, 7, 10, 3),
+        (1, 7, 10, 3),
+        (2, 8, 40, 4),
+        (3, 6, 10, 5),
+    ):
+        found = record(tmp_path, FRONT, BACK, *zoom, configuration=wanted)
+        assert [row.thickness for row in found.parts[:2]] == [gap, 44]
+        assert found.use.aperture == pupil and found.use.heights[1] == (0, angle)
+        assert (found.configurations, found.configuration) == (3, wanted or 1)
+        told = ["line 11: of 3 configurations number 1; give `configuration`"]
+        assert found.notes == ([] if wanted else told)
+    with pytest.raises(LensError, match="line 11: there is no configuration 4; the file has 3"):
+        record(tmp_path, FRONT, BACK, *zoom, configuration=4)
+    with pytest.raises(LensError, match="no configuration 2; the file has one alone"):
+        record(tmp_path, FRONT, BACK, configuration=2)
+    with pytest.raises(LensError, match="line 12: ZOO THI: 2 values"):
+        record(tmp_path, FRONT, BACK, "ZOO 3", "ZOO THI S1 7 8")
 
 
 def test_what_is_not_read_is_refused_by_line(tmp_path):

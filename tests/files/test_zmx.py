@@ -53,10 +53,10 @@ def text(*surfaces, object="INFINITY", tail=("MNUM 1 1",), **header):
     return "\n".join([*top[:13], *WAVES, *top[13:], *tail])
 
 
-def read(folder, *surfaces, missing="error", **others):
+def read(folder, *surfaces, missing="error", configuration=None, **others):
     path = folder / "lens.zmx"
     path.write_text(text(*(surfaces or (FRONT, BACK)), **others))
-    return load_system(path, missing)
+    return load_system(path, missing, configuration)
 
 
 def refused(folder, *surfaces, **others):
@@ -739,6 +739,88 @@ READ = (
 
 
 @pytest.mark.slow
+def rows(*operands):
+    """Rows of two configurations: each operand with its two values."""
+    each = ((*operand.split()[:2], operand.split()[2:]) for operand in operands)
+    return [f"{key} {at} {k + 1} {v} 0 0" for key, at, both in each for k, v in enumerate(both)]
+
+
+OPERANDS = (
+    "MOFF 0 0 1", "THIC 1 4 5", "THIC 0 1.00E+10 70", "CRVT 2 -.02 -.03", "CONN 2 0 -1",
+    "YFIE 2 5 3", "FLWT 2 2 4", "WAVE 1 .48 .5", "WLWT 2 3 7", "APER 0 10 8", "TEMP 0 20 20"
+)  # fmt: skip
+
+
+def test_each_configuration_is_read(tmp_path):
+    """The numbers of the rows in place of those beside; the current one as it stands there."""
+    tail = ("MNUM 2 1", *rows(*OPERANDS))
+    with pytest.warns(UserWarning, match="of 2 configurations number 1; give `configuration`"):
+        beside = read(tmp_path, tail=tail, UNIT="MM")
+    first, second = (read(tmp_path, tail=tail, UNIT="MM", configuration=k) for k in (1, 2))
+    assert (second.configurations, second.configuration, second.notes) == (2, 2, ())
+    same = np.array_equal(first.lens.thickness, beside.lens.thickness)
+    assert same and first.distance == beside.distance == np.inf and beside.configuration == 1
+    assert second.distance == 70 and second.lens.thickness[0] == 5 and first.lens.thickness[0] == 4
+    assert (second.lens.curvature[1], second.lens.conic[1], first.lens.conic[1]) == (-0.03, -1, 0)
+    np.testing.assert_array_equal(second.heights, [[0, 0], [1, 3]])
+    np.testing.assert_array_equal(second.field_weights, [1, 4])
+    np.testing.assert_array_equal(second.wavelengths, [0.5, 0.55])
+    np.testing.assert_array_equal(second.wavelength_weights, [1, 7])
+    assert (first.aperture, second.aperture) == (10, 8)
+    found = read(tmp_path, tail=("MNUM 2 1", *rows("SDIA 1 6 3")), ENPD=None, FLOA="",
+                 configuration=2)  # fmt: skip
+    assert found.lens.semi_diameter[0] == 3
+
+
+def test_rows_that_are_not_known_are_refused_where_they_differ(tmp_path):
+    tail = ("MNUM 2 1", *rows("TEMP 0 20 60"))
+    message = "line 39: TEMP, which differs between configurations; missing=.warn. leaves it out"
+    with pytest.raises(LensError, match=message):
+        read(tmp_path, tail=tail, configuration=2)
+    assert read(tmp_path, tail=tail, configuration=1).configuration == 1
+    for row in ("THIC 9 1 2", "YFIE 9 1 2", "WAVE 9 1 2"):
+        with pytest.raises(LensError, match=f"{row[:6]}: the file has none"):
+            read(tmp_path, tail=("MNUM 2 1", *rows(row)), configuration=2)
+    with pytest.raises(LensError, match="expected a number, got 'x'"):
+        read(tmp_path, tail=("MNUM 2 1", *rows("THIC 1 4 x")), configuration=2)
+    for wanted in (0, 3, "wide"):
+        with pytest.raises(LensError, match=f"line 37: there is no configuration {wanted!r}; the"):
+            read(tmp_path, tail=tail, configuration=wanted)
+
+
+def wild(name, configuration):
+    """A file from elsewhere, and its first-order data at its primary wavelength."""
+    (path,) = (SHARED.parent / "wild").glob(f"{name}*.zmx")
+    system = load_system(path, "warn", configuration)
+    return system, first_order(
+        system.lens, system.distance, jnp.array(system.wavelengths[system.primary :][:1])
+    )
+
+
+@LISTED
+@pytest.mark.parametrize(
+    ("name", "focal"),
+    [
+        ("Ricoh_smc_Pentax-FA_28-70mm", (29.0, 50.0, 68.0)),
+        ("Nikon_R-UW_AF_Zoom-Nikkor_20-35mm", (20.6, 26.5, 34.0)),
+    ],
+)
+def test_zooms_of_patents_are_in_focus_in_every_configuration(name, focal):
+    """Focal lengths of the patents, mm; the file's sensor lies in the paraxial focus of each."""
+    for k, wanted in enumerate(focal):
+        system, found = wild(name, k + 1)
+        np.testing.assert_allclose(found.effective_focal_length, wanted, atol=6e-3)
+        back = system.lens.sensor - jnp.sum(system.lens.thickness)
+        np.testing.assert_allclose(found.back_focal_distance, back, atol=6e-3)
+
+
+@LISTED
+def test_a_macro_lens_of_a_patent_has_its_magnifications():
+    for k, wanted in enumerate((0.0, -0.5, -1.0)):
+        _, found = wild("Nikon_R-UW_AF_Micro-Nikkor_50mm", k + 1)
+        np.testing.assert_allclose(found.magnification, wanted, atol=2e-4)
+
+
 @LISTED
 @pytest.mark.parametrize("name", READ)
 def test_listed_first_order(name):

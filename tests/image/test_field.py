@@ -1,5 +1,7 @@
 """From a field to its image point and back."""
 
+import pathlib
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -44,3 +46,14 @@ def test_clear_errors():
         drt_jax.field_of_image(LENS, 3.0, 1e4, 0.55)
     with pytest.raises(ValueError, match="outside the range"):
         drt_jax.image_point(LENS, Scene.point(0.0, 1e4, [0.1]))
+
+
+@pytest.mark.slow
+def test_a_field_is_found_where_rounding_stops_newton():
+    """At 21.6 mm of this zoom no step came below the tolerance, and the field was called inf."""
+    path = pathlib.Path(__file__).resolve().parents[2] / "configs/design/lenses/us5568323.zmx"
+    lens = drt_jax.load_lens(path, configuration=2)
+    for height in np.linspace(21.5, 21.7, 9):
+        angles = drt_jax.field_of_image(lens, (0.0, height), np.inf, 0.5876)
+        found = drt_jax.image_point(lens, Scene.point(angles, np.inf, 0.5876))[0]
+        np.testing.assert_allclose(found, [0, height], rtol=0, atol=1e-9)

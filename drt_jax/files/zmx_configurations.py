@@ -1,0 +1,86 @@
+"""Configurations of `.zmx` files: rows behind MNUM, one for each configuration.
+
+The surfaces and the header have the numbers of the current configuration. The rows of another one
+are written over them before they are read.
+"""
+
+from .record import Record, Words
+
+# The keyword of a surface, of a list over fields and of the entry of a wavelength that a row
+# changes.
+_SURFACE = {"THIC": "DISZ", "CRVT": "CURV", "CONN": "CONI", "SDIA": "DIAM"}
+_FIELD = {
+    "XFIE": "XFLN", "YFIE": "YFLN", "FLWT": "FWGN", "FVDX": "VDXN", "FVDY": "VDYN",
+    "FVCX": "VCXN", "FVCY": "VCYN", "FVAN": "VANN"
+}  # fmt: skip
+_WAVE = {"WAVE": 1, "WLWT": 2}
+_APERTURE = "ENPD", "FNUM", "OBNA"
+_NO_NUMBER = "MOFF", "MCOM", "NOTE"
+
+
+def choose(record: Record, found: list[Words], configuration: int | None) -> None:
+    """Write the numbers of a configuration over those of the current one, in place.
+
+    LensError for a number that the file does not have; where a row that differs is not known, as in
+    `Record.lacks`.
+
+    found: the lines of the file. configuration: its number in the file, from 1; None for the
+    current one.
+    """
+    at = next((k for k, words in enumerate(found) if words.key == "MNUM"), None)
+    line, count, current = 0, 1, 1
+    if at is not None:
+        line, count, current = found[at].line, found[at].count(0, 1), found[at].count(1, 1)
+    record.choose(line, count, current, configuration)
+    if at is None or record.configuration == current:
+        return
+    for rows in _operands(found[at + 1 :], count):
+        own, before = rows[record.configuration - 1], rows[current - 1]
+        if own.key not in _NO_NUMBER and own.values[2] != before.values[2]:
+            _write(record, found, own)
+
+
+def _operands(found: list[Words], count: int) -> list[list[Words]]:
+    """The rows of each operand, one for each configuration."""
+    operands = []
+    for first in range(0, len(found), count):
+        rows = found[first : first + count]
+        named = {(words.key, *words.values[:1]) for words in rows}
+        numbers = [words.values[1:2] for words in rows if len(words.values) > 2]
+        if len(named) > 1 or numbers != [[str(k + 1)] for k in range(count)]:
+            break
+        operands.append(rows)
+    return operands
+
+
+def _write(record: Record, found: list[Words], row: Words) -> None:
+    """Write the number of a row over the one that is read."""
+    key, where, value = row.key, row.count(), row.values[2]
+    row.number(2)  # LensError for what is no number
+    first = next((k for k, words in enumerate(found) if words.key == "SURF"), 0)
+    head = found[:first]
+    what = f"{key} {where}: the file has none"
+    if key in _SURFACE:
+        starts = [k for k, words in enumerate(found) if words.key == "SURF"]
+        row.require(0 <= where < len(starts), what)
+        start, end = starts[where], [*starts, len(found)][where + 1]
+        name = _SURFACE[key]
+        own = [words for words in found[start:end] if words.key == name]
+        if own:
+            own[0].values[:1] = [value]
+        else:
+            found.insert(start + 1, Words(record, row.line, name, [value], True))
+    elif key in _FIELD:
+        lists = [words for words in head if words.key == _FIELD[key]]
+        row.require(lists and 1 <= where <= len(lists[0].values), what)
+        lists[0].values[where - 1] = value
+    elif key in _WAVE:
+        waves = [words for words in head if words.key == "WAVM" and words.count() == where]
+        row.require(waves and len(waves[0].values) > _WAVE[key], what)
+        waves[0].values[_WAVE[key]] = value
+    elif key == "APER":
+        for words in head:
+            if words.key in _APERTURE:
+                words.values[:1] = [value]
+    else:
+        record.lacks(row.line, f"{key}, which differs between configurations")

@@ -1,0 +1,198 @@
+"""Re-optimise a zoom lens, or one that focuses, in all configurations of its file at once.
+
+The settings name what moves, with a value of its own in each configuration, and what all share.
+Writes the lens of each configuration, before and after, as YAML, and results.json: `rows` with
+`configuration`, `focal_mm`, `merit_start`, `merit_moved` (only what moves is optimised),
+`merit_end`, and `spots_um` of start and end.
+"""
+
+import dataclasses
+import math
+import pathlib
+import sys
+import time
+from typing import Annotated, Any
+
+import jax.numpy as jnp
+import numpy as np
+
+import drt_jax
+from drt_jax import Scene, design, show
+from drt_jax.design import Operand, Vary
+from drt_jax.design.operands import OperandName
+from drt_jax.files.load import System
+
+from . import _command, _common, _plots
+from ._common import not_empty, require, within
+from .runs.folder import Run
+
+COLUMNS = ("merit", "worst", "jacobians")
+
+
+@dataclasses.dataclass(frozen=True)
+class Keep:
+    """A value that each configuration keeps.
+
+    kind: an operand without rays. per_cent: by how much its value may change.
+    """
+
+    kind: OperandName
+    per_cent: Annotated[float, within(1e-6, 1e3)] = 1.0
+
+
+@dataclasses.dataclass(frozen=True)
+class Config:
+    """Settings of the experiment.
+
+    lens: a `.zmx` or `.seq` file with several configurations; with its fields and wavelengths.
+    moving: variables of which each configuration has its own.
+    shared: variables that all configurations share.
+    operands: of each configuration.
+    keep: what each configuration keeps of the file.
+    weights: of the squares of each configuration; empty for equal weights.
+    order: order of the pupil rule.
+    tolerance: relative error of the spots.
+    trials: most trials of a search.
+    """
+
+    lens: str = "configs/design/lenses/us5568323.zmx"
+    moving: Annotated[tuple[Vary, ...], not_empty] = (Vary("sensor"),)
+    shared: tuple[Vary, ...] = (Vary("curvature"),)
+    operands: Annotated[tuple[Operand, ...], not_empty] = (Operand("spot"),)
+    keep: tuple[Keep, ...] = ()
+    weights: tuple[float, ...] = ()
+    order: Annotated[int, within(1, 40)] = 4
+    tolerance: Annotated[float, within(1e-12, 0.5)] = 1e-3
+    trials: Annotated[int, within(1, 1e5)] = 600
+
+
+def problem_of(config: Config, system: System, vary: tuple[Vary, ...]) -> design.Problem:
+    """The problem of one configuration. It keeps its f-number by a solve of its stop; what else it
+    keeps are limits about the values at the start."""
+    wave = float(system.wavelengths[system.primary])
+    solve = design.Solve("f_number", distance=system.distance, wavelengths=(wave,))
+    lens = design.open_apertures(system.lens)
+    variables, kept = design.Variables.from_lens(lens, vary, solves=[solve]), []
+    for keep in config.keep:
+        alone = design.Problem.from_variables(variables, [keep.kind], system.scene)
+        (value,) = np.asarray(alone.evaluate(variables.start).residuals).tolist()
+        most = 0.01 * keep.per_cent * abs(value)
+        kept.append(Operand(keep.kind, low=value - most, high=value + most))
+    operands = (*config.operands, *kept)
+    return design.Problem.from_variables(variables, operands, system.scene, config.order)
+
+
+def zoom_of(
+    config: Config, systems: list[System], shared: tuple[Vary, ...]
+) -> design.Configurations:
+    """The problem of all configurations."""
+    problems = [problem_of(config, system, (*config.moving, *shared)) for system in systems]
+    lens = problems[0].variables.lens
+    own = [str(place) for vary in config.moving for place in vary.places(lens)]
+    return design.Configurations.from_problems(problems, own, config.weights or None)
+
+
+def searched(config: Config, zoom: design.Configurations, run: Run, job: str) -> dict[str, Any]:
+    """The end of a search from the start: its vector, merits, limit and time."""
+    begun = time.perf_counter()
+    found = design.optimise(zoom, max_steps=config.trials)
+    run.log(job, 0, dict(zip(COLUMNS, found.history.T)))
+    return {
+        "vector": found.vector.tolist(),
+        "merits": zoom.merits(jnp.asarray(found.vector)).tolist(),
+        "ended": found.ended,
+        "worst": str(found.worst_limit or ""),
+        "jacobians": found.jacobians,
+        "seconds": found.seconds,
+        "compile_s": time.perf_counter() - begun - found.seconds,
+    }
+
+
+def spots_um(config: Config, lens: drt_jax.Lens, scene: Scene) -> list[float]:
+    """RMS radii of the spots of all fields about the centroid of all wavelengths."""
+    weights = None if scene.wavelength_weights is None else np.asarray(scene.wavelength_weights)
+    points = (scene.at(field) for field in np.asarray(scene.field))
+    return [_common.spot_um(lens, point, config.tolerance, weights)[0] for point in points]
+
+
+def run(config: Config, run: Run) -> dict[str, Any]:
+    """Optimises what moves, then all, and writes the lens of each configuration."""
+    first = drt_jax.load_system(config.lens, configuration=1)
+    count = range(1, first.configurations + 1)
+    systems = [drt_jax.load_system(config.lens, configuration=k) for k in count]
+    require(len(systems) > 1, f"lens: {config.lens} has one configuration; give several")
+    moved, zoom = zoom_of(config, systems, ()), zoom_of(config, systems, config.shared)
+    ends = {
+        "moved": run.once("moved", lambda: searched(config, moved, run, "moved")),
+        "designed": run.once("designed", lambda: searched(config, zoom, run, "designed")),
+    }
+    begin = zoom.variables.start
+    end = zoom.fitted(ends["designed"]["vector"], margin=1e-3)
+    lenses = {"start": [system.lens for system in systems], "designed": end}
+    rows: list[dict[str, Any]] = [{"configuration": k} for k in count]
+    merits = {"start": zoom.merits(begin).tolist(), "moved": ends["moved"]["merits"]}
+    merits["end"] = ends["designed"]["merits"]
+    for name, values in merits.items():
+        for row, value in zip(rows, values, strict=True):
+            row[f"merit_{name}"] = value
+    for name, some in lenses.items():
+        for row, system, lens in zip(rows, systems, some, strict=True):
+            drt_jax.save_lens(lens, run.folder / f"{name}_{row['configuration']}.yaml")
+            row[f"spots_um_{name}"] = spots_um(config, lens, system.scene)
+            wave = system.wavelengths[system.primary :][:1]
+            focal = drt_jax.first_order(lens, system.distance, wave).effective_focal_length
+            row[f"focal_mm_{name}"] = float(focal[0])
+    for row, system in zip(rows, systems, strict=True):
+        far = system.distance
+        row["fields_deg"] = np.degrees(np.asarray(system.scene.field)[:, 1]).tolist()
+        row["distance_mm"] = far if math.isfinite(far) else None
+    searches = {name: {k: v for k, v in end.items() if k != "vector"} for name, end in ends.items()}
+    waves = {"wavelengths_um": first.wavelengths.tolist()}
+    return {"rows": rows, "searches": searches, **waves, **_common.settings(config, "lens")}
+
+
+def tables(results: dict[str, Any]) -> dict[str, str]:
+    """Merit and spots of each configuration before and after, and the searches."""
+    header = ["configuration", "focal length, mm", "merit, mm^2, of the file", "gaps alone", "all"]
+    header += ["RMS um, of the file", "all"]
+    rows = [
+        [
+            *(row[key] for key in ("configuration", "focal_mm_designed")),
+            *(row[f"merit_{name}"] for name in ("start", "moved", "end")),
+            *(
+                ", ".join(f"{um:.1f}" for um in row[f"spots_um_{name}"])
+                for name in ("start", "designed")
+            ),
+        ]
+        for row in results["rows"]
+    ]
+    keys = ("ended", "jacobians", "seconds", "compile_s", "worst")
+    searches = [[name, *map(end.get, keys)] for name, end in results["searches"].items()]
+    titles = ["search", "ended", "Jacobians", "seconds", "compilation, s", "the nearest limit"]
+    return {
+        "zoom": _common.table(header, rows),
+        "zoom: searches": _common.table(titles, searches),
+    }
+
+
+def draw(results: dict[str, Any], figures: pathlib.Path) -> None:
+    """Draws start and end in all configurations, side by side at one scale, the sensors in line."""
+    rows, waves = results["rows"], results["wavelengths_um"]
+    drawings = []
+    for row in rows:
+        scene = Scene.degrees(row["fields_deg"], row["distance_mm"] or math.inf, waves)
+        for name in ("start", "designed"):
+            lens = drt_jax.load_lens(figures.parent / f"{name}_{row['configuration']}.yaml")
+            drawings.append((row, name, float(lens.sensor), show.draw(lens, scene)))
+    long = max(sensor for _, _, sensor, _ in drawings)
+    with _plots.picture(figures / "zoom.png", 7.0, 2.5, len(drawings), 2) as axes:
+        for ax, (row, name, sensor, drawing) in zip(axes, drawings, strict=True):
+            show.lens_drawing(ax, drawing)
+            ax.set_xlim(sensor - 1.12 * long, sensor + 0.03 * long)
+            spot = math.hypot(*row[f"spots_um_{name}"]) / math.sqrt(len(row["fields_deg"]))
+            focal = row[f"focal_mm_{name}"]
+            ax.set_title(f"{name}, f = {focal:.1f} mm, spots {spot:.1f} um", fontsize=9)
+
+
+if __name__ == "__main__":
+    _command.main(sys.modules[__name__])
