@@ -29,7 +29,7 @@ def sensitivity(axes: Axes, table: Sensitivity, count: int = 14) -> Axes:
     most = _LARGEST * float(np.max(np.abs(finite), initial=0)) or 1.0
     axes.barh(names, np.minimum(held, most), 0.8, color="0.8", label="before")
     axes.barh(names, np.minimum(after, most), 0.5, color="tab:blue", label="after compensation")
-    for k in map(int, np.flatnonzero(held > most)):
+    for k in np.flatnonzero(held > most).tolist():
         words = f"{held[k]:.3g}" if np.isfinite(held[k]) else "fails"
         axes.text(most, k, words, ha="right", va="center", fontsize=6, color="0.3")
     axes.set_xlim(min(0.0, 1.05 * float(np.min(finite, initial=0))), 1.02 * most)
