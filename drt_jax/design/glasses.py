@@ -189,6 +189,8 @@ def snap_glasses(
             search = take_step(quick(own), search)
         return _Trial(place, near, own, np.asarray(search.vector), float(search.score))
 
+    single = isinstance(problem, Problem)
+    require(single, "problem: snap_glasses takes one configuration, of `Configurations.problems`")
     places, snaps = _places(problem), list[Snap]()
     left, done = [*places], False
     while not done:

@@ -7,7 +7,8 @@ import jax.numpy as jnp
 from jax import Array
 
 from ..numerics import matmul, safe_divide, safe_sqrt
-from .problem import Problem, quick
+from ..rays.solve import solve_aimed
+from .configurations import AnyProblem
 
 # A limit with a violation up to this counts as met, in the units of `Evaluation.constraints`.
 _MET = 1e-4
@@ -75,7 +76,7 @@ def nearest(vector: Array, metric: Array, rows: Array, most: Array) -> Array:
 
 
 def within_limits(
-    problem: Problem, before: Array, after: Array, metric: Array | None = None
+    problem: AnyProblem, before: Array, after: Array, metric: Array | None = None
 ) -> Array:
     """The vector with which an optimiser continues: `after`, changed as little as needed.
 
@@ -95,7 +96,7 @@ def within_limits(
 
     Returns (N,).
     """
-    problem = quick(problem)
+    problem = problem.with_solver(solve_aimed)
     low, high = problem.variables.low, problem.variables.high
     after = jnp.where(jnp.isfinite(after), after, before)
     one = jnp.eye(len(after), dtype=after.dtype)

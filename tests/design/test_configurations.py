@@ -236,6 +236,19 @@ def test_what_does_not_fit_is_refused(message):
         Configurations.from_problems([other(**one) for one in given], own)
 
 
+def test_glasses_take_one_configuration():
+    both = Configurations.from_problems([other(), other()])
+    with pytest.raises(ValueError, match="problem: snap_glasses takes one configuration"):
+        design.snap_glasses(both, None)
+    # Updates are led back within the bounds of all.
+    shared = Configurations.from_problems(
+        [other(vary=[Vary("sensor", low=low)]) for low in (41.5, 42.0)]
+    )
+    start = shared.variables.start
+    held = design.within_limits(shared, start, start - 5.0 / shared.variables.scale)
+    np.testing.assert_allclose(shared.variables.numbers(held), [42.0])
+
+
 @pytest.mark.parametrize(
     ("numbers", "message"),
     [
