@@ -41,16 +41,14 @@ ALLOWED = {
     "show": set(),
 }
 # Drawings of rays; and the namespace of `learn`.
-ALLOWED_ALL = {"learn.__init__"} | {
-    f"show.{name}"
-    for name in ("aberrations", "analyses", "glasses", "layout", "more", "prescription", "sheet")
-}
+_DRAWN = "aberrations", "analyses", "glasses", "layout", "more", "prescription", "sheet"
+ALLOWED_ALL = {"learn.__init__", *(f"show.{name}" for name in (*_DRAWN, "tolerances"))}
 # Most lines of code of each room; no blank, comment, docstring or import is counted. They
 # fall, and rise only by a new capability, whose commit says by how much: text is free, code is not.
 ROOMS = {
     "drt_jax": 559,
     "drt_jax/check": 298,
-    "drt_jax/design": 3210,
+    "drt_jax/design": 3212,
     "drt_jax/files": 3015,
     "drt_jax/image": 3043,
     "drt_jax/learn": 656,
