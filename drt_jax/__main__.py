@@ -66,6 +66,8 @@ def _options(argv: list[str] | None) -> argparse.Namespace:
     show.add_argument("lens", help=f".yaml, .zmx or .seq file, or a bundled name: {names}")
     own = "default: those of a .zmx or .seq file, else"
     ends = "default: those of a .zmx or .seq file with their weights, else"
+    which = "number of a configuration or zoom position of a .zmx or .seq file, from 1"
+    show.add_argument("--configuration", type=int, help=which)
     show.add_argument("--field", type=float, nargs="+", help=f"degrees; {own} 0 7 10")
     show.add_argument("--distance", type=float, help=f"to the object, mm; {own} inf")
     show.add_argument("--wavelengths", type=float, nargs="+", help=f"um; {ends} C, d and F")
@@ -79,6 +81,7 @@ def _options(argv: list[str] | None) -> argparse.Namespace:
     convert = command("convert", run_convert, about)
     convert.add_argument("lens", help=".yaml, .zmx or .seq file, or a bundled name")
     convert.add_argument("out", type=pathlib.Path, help="file that ends in .yaml, .zmx or .seq")
+    convert.add_argument("--configuration", type=int, help=which)
     convert.add_argument("--missing", choices=("error", "warn"), default="error", help=_MISSING)
     about = "index, Abbe number, partial dispersion, range and source of a glass, its neighbours"
     glasses.arguments(command("glass", lambda options: _write(glasses.told(options)), about))
@@ -231,7 +234,7 @@ def run_convert(options: argparse.Namespace) -> None:
     kind = pathlib.Path(options.lens).suffix.lower()
     load = load_system if kind in (".zmx", ".seq") else load_lens
     with _warnings_on_stdout():
-        found = load(options.lens, options.missing)
+        found = load(options.lens, options.missing, options.configuration)
         save_lens(found, options.out)
     lens = found.lens if isinstance(found, System) else found
     _write([f"{lens.name or 'the lens'}, {lens.count} surfaces, is written to {options.out}"])
@@ -264,7 +267,7 @@ def _view(options: argparse.Namespace) -> _View:
     fields, distance, waves, note = [0.0, 7.0, 10.0], math.inf, list(_LINES), ""
     weights = {wave: 1.0 for wave in waves}
     if pathlib.Path(options.lens).suffix.lower() in (".zmx", ".seq"):
-        system = load_system(options.lens, options.missing)
+        system = load_system(options.lens, options.missing, options.configuration)
         lens, distance = system.lens, system.distance
         primary = float(system.wavelengths[system.primary])
         weights = dict(zip(map(float, system.wavelengths), map(float, system.wavelength_weights)))
@@ -283,7 +286,7 @@ def _view(options: argparse.Namespace) -> _View:
         elif options.field is None:
             warnings.warn("the file has no fields along y alone: --field 0 7 10", stacklevel=2)
     else:
-        lens = load_lens(options.lens, options.missing)
+        lens = load_lens(options.lens, options.missing, options.configuration)
     distance = distance if options.distance is None else options.distance
     waves = options.wavelengths or waves
     shares = [weights.get(wave, 1.0) for wave in waves]

@@ -208,6 +208,7 @@ def test_ctrl_c_is_one_line(monkeypatch, capsys):
         (["show", "singlet", "--field", "90"], "--field: must be within 90 degrees"),
         (["show", "singlet", "--distance", "0"], "distance: must be 1e-06 mm or more"),
         (["show", "singlet", "--wavelengths", "9"], "outside the range"),
+        (["convert", "singlet", "a.zmx", "--configuration", "2"], "in YAML has one alone"),
         (["convert", "singlet", "lens.txt"], "lens.txt: expected a name that ends in .yaml"),
     ],
 )

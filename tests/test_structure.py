@@ -46,10 +46,10 @@ ALLOWED_ALL = {"learn.__init__", *(f"show.{name}" for name in (*_DRAWN, "toleran
 # Most lines of code of each room; no blank, comment, docstring or import is counted. They
 # fall, and rise only by a new capability, whose commit says by how much: text is free, code is not.
 ROOMS = {
-    "drt_jax": 559,
+    "drt_jax": 562,
     "drt_jax/check": 298,
     "drt_jax/design": 3212,
-    "drt_jax/files": 3015,
+    "drt_jax/files": 3017,
     "drt_jax/image": 3043,
     "drt_jax/learn": 656,
     "drt_jax/lens": 1563,

@@ -130,6 +130,8 @@ def load_lens(
             lens = _lens_of(record)
             record.say()
             return lens
+        only = f"{path}: configuration: a prescription in YAML has one alone"
+        require(configuration is None, only)
         with naming(path):
             return _lens_of_yaml(read_text(path), path)
 
