@@ -27,7 +27,7 @@ check: install
 # Programs that one run of the tests has compiled serve the next.
 test test-slow test-release test-all test-versions site: export JAX_COMPILATION_CACHE_DIR ?= $(CURDIR)/.compiled
 
-# With PART=0 to 5, as in CI, also a sixth of the larger scenes.
+# With PART=0 to 6, as in CI, also a seventh of the larger scenes.
 test: install
 	$(BIN)/python -m pytest $(if $(PART),-m "not release" --durations=60 --part=$(PART))
 

@@ -34,8 +34,8 @@ jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
 # takes a seventh of the time of the tests.
 gc.set_threshold(100_000, 20, 20)
 
-# All slow tests take longer than CI may: it runs another sixth of them for another commit.
-PARTS = 6
+# All slow tests take longer than CI may: it runs another seventh of them for another commit.
+PARTS = 7
 LONGEST = ("test_readme.py", "test_experiments.py", "test_derivatives.py")
 RGB = (0.6, 0.53, 0.48)
 LENSES = ("double_gauss", "double_gauss_addon", "cooke_triplet", "singlet")
@@ -46,7 +46,7 @@ def pytest_addoption(parser):
     --times.
     """
     parser.addoption("--write-tables", action="store_true", help="rewrite the tables in results/")
-    parser.addoption("--part", type=int, choices=range(PARTS), help="a sixth of the slow tests")
+    parser.addoption("--part", type=int, choices=range(PARTS), help="a seventh of the slow tests")
     parser.addoption("--times", metavar="FILE", help="where the time goes, see times.py")
 
 
@@ -58,7 +58,7 @@ def pytest_configure(config):
 
 def pytest_collection_modifyitems(config, items):
     """Files with long tests first: none is left for one worker alone at the end. With `--part`,
-    every sixth slow function; the cases of one share programs."""
+    every seventh slow function; the cases of one share programs."""
     items.sort(key=lambda item: item.path.name not in LONGEST)
     part = config.getoption("--part")
     if part is None:

@@ -48,11 +48,11 @@ ALLOWED_ALL = {"learn.__init__", *(f"show.{name}" for name in (*_DRAWN, "toleran
 ROOMS = {
     "drt_jax": 562,
     "drt_jax/check": 298,
-    "drt_jax/design": 3212,
+    "drt_jax/design": 3218,
     "drt_jax/files": 3017,
     "drt_jax/image": 3043,
     "drt_jax/learn": 656,
-    "drt_jax/lens": 1563,
+    "drt_jax/lens": 1566,
     "drt_jax/pupil": 776,
     "drt_jax/rays": 1314,
     "drt_jax/show": 1178,

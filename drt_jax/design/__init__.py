@@ -9,7 +9,8 @@ from ..lens.insert import (
 from . import least_squares as least_squares
 from .assembly import Assembly as Assembly, as_built as as_built
 from .compensation import AsBuilt as AsBuilt
-from .configurations import Configurations as Configurations, configured as configured
+from .configurations import Configurations as Configurations
+from .configured import configured as configured
 from .field_rays import FieldRays as FieldRays
 from .focusing import Focusing as Focusing, focusing as focusing
 from .glasses import (

@@ -7,8 +7,7 @@ evaluated together, by `jax.vmap` over the numbers that differ between them.
 """
 
 import dataclasses
-import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
@@ -16,13 +15,13 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from ..inputs import require, require_one_of
+from ..inputs import require
 from ..lens.lens import Lens
 from ..numerics import Numbers
 from ..rays.solve import Solver
 from .least_squares import Evaluation
 from .limits import Limit
-from .parts import PARTS, Place, places_of, with_arrays, with_numbers
+from .parts import Place
 from .problem import Problem, weights_of, with_apertures
 from .variables import Variables
 
@@ -30,35 +29,6 @@ from .variables import Variables
 _EQUAL = 1e-6
 # Most numbers that are printed.
 _TOLD = 8
-
-
-def configured(lens: Lens, numbers: Mapping[str, Sequence[float]]) -> tuple[Lens, ...]:
-    """The C configurations of a lens, which share all numbers but some.
-
-    lens: the lens.
-    numbers: C numbers for each name, such as {"thickness 4": (1.2, 9.8), "sensor": (30.1, 41.5)}.
-        A name is a kind of `Vary`, the number of the surface and, of parts with several terms, the
-        term: "tilt 3[0]". Units as in `Vary`.
-
-    ValueError, which names it, for a number that the lens does not have, and for other counts.
-    """
-    places, counts = {}, {name: np.shape(row) for name, row in numbers.items()}
-    for name in numbers:
-        match = re.fullmatch(r"(\w+)(?: (\d+))?(?:\[(\d+)\])?", name)
-        kind, *rest = match.groups() if match else (name, None, None)
-        require_one_of("configured: kind", kind, PARTS)
-        surfaces, terms = (() if number is None else (int(number),) for number in rest)
-        found = places_of("configured", lens, kind, surfaces, terms)
-        some = f"name one, such as {found[-1]}"
-        require(len(found) == 1, f"configured: {name}: is {len(found)} numbers; {some}")
-        places[name] = found[0]
-    alike = len(set(counts.values())) == 1 and all(len(n) == 1 and n[0] for n in counts.values())
-    found_counts = ", ".join(f"{name} has the shape {shape}" for name, shape in counts.items())
-    require(alike, f"configured: give as many numbers for each name; {found_counts or 'none'}")
-    lens = with_arrays(lens, {place.kind for place in places.values()})
-    rows = [[*zip(places.values(), row)] for row in zip(*numbers.values())]
-    dtype = lens.curvature.dtype
-    return tuple(with_numbers(lens, [(p, jnp.asarray(n, dtype)) for p, n in row]) for row in rows)
 
 
 @jax.tree_util.register_dataclass

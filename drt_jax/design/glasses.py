@@ -13,9 +13,10 @@ from ..inputs import require
 from ..lens.glass import Glass, nd_and_vd
 from ..lens.glasses import Neighbour, nearest_glasses
 from ..lens.lens import Lens, glass_rows, with_glass
+from ..rays.solve import solve_aimed
 from .media import model_glasses
 from .optimum import Optimum, init_problem, optimise, take_step
-from .problem import Problem, quick
+from .problem import Problem
 
 # Two media count as the same medium if their nd and vd differ by less than this.
 _SAME = (1e-5, 1e-2)
@@ -184,9 +185,10 @@ def snap_glasses(
         """Some steps of least squares with a glass in a place."""
         place, near = task
         own, start = _with_glass(problem, found.vector, place, near.glass)
-        search = init_problem(quick(own), jnp.asarray(start, own.variables.low.dtype))
+        tried = own.with_solver(solve_aimed)
+        search = init_problem(tried, jnp.asarray(start, own.variables.low.dtype))
         for _ in range(steps):
-            search = take_step(quick(own), search)
+            search = take_step(tried, search)
         return _Trial(place, near, own, np.asarray(search.vector), float(search.score))
 
     single = isinstance(problem, Problem)

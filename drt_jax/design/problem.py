@@ -17,7 +17,7 @@ from ..lens.scene import Scene, checked_scene, vergence_of
 from ..numerics import Numbers, concrete
 from ..pupil.clipped import Clipped
 from ..pupil.rules import Gauss, PupilRule
-from ..rays.solve import Solver, solve, solve_aimed
+from ..rays.solve import Solver, solve
 from .failures import failures
 from .field_rays import FieldRays, beam_radius, symmetry_by_structure, trace_views
 from .least_squares import Evaluation
@@ -191,7 +191,9 @@ class Problem:
         return "\n".join([*first, *lines[:6], *more])
 
     def with_solver(self, solver: Solver) -> "Problem":
-        """The problem with another ray solver."""
+        """The problem with another ray solver; with `solve_aimed` it is a smaller program, without
+        the full ray search.
+        """
         return dataclasses.replace(self, solver=solver)
 
     def with_order(self, order: int) -> "Problem":
@@ -314,13 +316,6 @@ def _exceeded(problem: Problem, vector: Array) -> Array:
 
 
 _exceeded_slopes = jax.jit(jax.jacfwd(_exceeded, argnums=1))
-
-
-def quick(problem: Problem) -> Problem:
-    """The problem with `solve_aimed` as its solver, a smaller program without the full ray
-    search.
-    """
-    return problem.with_solver(solve_aimed)
 
 
 def open_apertures(lens: Lens) -> Lens:

@@ -22,7 +22,8 @@ import jax.numpy as jnp
 from jax import Array
 
 from ..numerics import matmul, safe_divide, safe_sqrt
-from .problem import Problem, quick
+from ..rays.solve import solve_aimed
+from .problem import Problem
 from .within_limits import within_limits
 
 
@@ -76,7 +77,7 @@ class RaySteps:
 
     def metric(self, vector: Array) -> Array:
         """B, (N, N), mm^2, at a vector."""
-        spots = quick(self.spots)
+        spots = self.spots.with_solver(solve_aimed)
         slopes = jax.jacfwd(lambda v: spots.evaluate(v).residuals)(vector)
         square = matmul(slopes.T, slopes) / (len(spots.fields) * len(spots.distances))
         diagonal = jnp.diagonal(square)

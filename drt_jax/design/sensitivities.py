@@ -125,7 +125,7 @@ def sensitivity(
     predicted: what `predict` has found with the same arguments: the table is then that of second
         derivatives, and nothing is traced.
 
-    ValueError as in `as_built`.
+    ValueError as in `as_built`, and for a lens that fails without errors.
     """
     assembly = Assembly.of(compensator).placed(problem, perturbed.lens, perturbed.beam_radius)
     count = len(perturbed.deviations)
@@ -148,6 +148,7 @@ def sensitivity(
         named = tuple((str(one), KINDS[one.kind].unit) for one in parts.deviations)
     values, held, moves = (np.asarray(array, float) for array in (values, held, moves))
     pairs = (np.stack([a[:count], a[count : 2 * count]], axis=1) for a in (held, values))
+    _require_nominal(float(values[-1]))
     before, after = (pair - values[-1] for pair in pairs)
     shifts = moves - moves[-1]
     return Sensitivity(
@@ -187,7 +188,8 @@ def inverse_sensitivity(
     most: largest factor of the sizes that are given. An error that does less than the drop gets
         these.
 
-    ValueError as in `as_built`, and for a drop or a factor that is not above 0.
+    ValueError as in `as_built`, for a lens that fails without errors, and for a drop or a factor
+    that is not above 0.
     """
     require(0 < drop < np.inf, f"drop: must be above 0 and finite, got {drop:g}")
     require(0 < most < np.inf, f"most: must be above 0 and finite, got {most:g}")
@@ -200,6 +202,7 @@ def inverse_sensitivity(
         """Loss beyond that without errors (P, 2), at sizes (P, 2) to both sides."""
         rows = [np.diag(side) for side in (signs * sizes).T]
         built = monte_carlo(problem, perturbed, np.concatenate([*rows, zero]), assembly)
+        _require_nominal(float(built.value[-1]))
         loss = np.asarray(assembly.loss(built.value))
         return (loss[:-1] - loss[-1]).reshape(2, count).T
 
@@ -207,15 +210,7 @@ def inverse_sensitivity(
     size = np.minimum(np.ones((count, 2)), top)
     low, high = np.zeros_like(size), np.broadcast_to(top, size.shape)
     old, fell = size, growths(size)
-    # The drop is a t + b t^2 for an error of the size t, with the sign of a to one side.
-    slope, bend = (fell[:, 1] - fell[:, 0]) / 2, (fell[:, 1] + fell[:, 0]) / 2
-    t = top * np.geomspace(1e-4, 1, _GRID)
-    size = np.empty_like(old)
-    for side, sign in enumerate(signs):
-        part = t / old[:, :1]
-        reached = sign * slope[:, None] * part + bend[:, None] * part**2 >= drop
-        first = np.argmax(reached, axis=1)
-        size[:, side] = np.where(reached.any(axis=1), t[np.arange(count), first], top[:, 0])
+    size = _parabola_sizes(old, fell, top, drop)
     for _ in range(_TRIALS):
         found = growths(size)
         low = np.where(found < drop, np.maximum(low, size), low)
@@ -235,6 +230,28 @@ def inverse_sensitivity(
     return dataclasses.replace(
         perturbed, sizes=perturbed.sizes * least.astype(perturbed.sizes.dtype)
     )
+
+
+def _require_nominal(value: float) -> None:
+    """ValueError unless the criterion of the lens without errors is finite."""
+    lost = "problem: without errors rays of the lens fail or no light of a field arrives"
+    require(np.isfinite(value), f"{lost}: give smaller fields, or a smaller stop")
+
+
+def _parabola_sizes(size: np.ndarray, fell: np.ndarray, top: np.ndarray, drop: float) -> np.ndarray:
+    """Sizes (P, 2) at which errors take the criterion by `drop`, at most `top` (P, 1), from its
+    changes `fell` (P, 2) at sizes (P, 2) to both sides.
+
+    The change is a t + b t^2 for an error of the size t, with the sign of a to one side.
+    """
+    slope, bend = (fell[:, 1] - fell[:, 0]) / 2, (fell[:, 1] + fell[:, 0]) / 2
+    t, found = top * np.geomspace(1e-4, 1, _GRID), np.empty_like(size)
+    part, rows = t / size[:, :1], np.arange(len(size))
+    for side, sign in enumerate((-1.0, 1.0)):
+        reached = sign * slope[:, None] * part + bend[:, None] * part**2 >= drop
+        first = np.argmax(reached, axis=1)
+        found[:, side] = np.where(reached.any(axis=1), t[rows, first], top[:, 0])
+    return found
 
 
 def yields(values: np.ndarray, levels: Numbers, compensator: Given = "focus") -> np.ndarray:

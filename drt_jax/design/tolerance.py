@@ -27,7 +27,7 @@ from .assembly import Assembly, Given
 from .compensation import AsBuilt, Compensator, compensated
 from .field_rays import FieldRays, symmetry_by_structure, trace_views
 from .perturbed import KINDS, PerturbedLens
-from .problem import Problem, quick, trace_fields
+from .problem import Problem, trace_fields
 from .tiles import in_tiles
 
 _TILE = 50  # number of lenses in a tile
@@ -120,7 +120,7 @@ def monte_carlo(
             callback(sum(len(part.squares) for part in parts))
         return jax.tree.map(lambda *arrays: np.concatenate(arrays), *parts)
 
-    found = traced(quick(problem), rows, callback)
+    found = traced(problem.with_solver(solve_aimed), rows, callback)
     # The full search may find rays that aiming does not find.
     failed = np.flatnonzero(~np.all(np.isfinite(found.squares), axis=1))
     if len(failed):
@@ -271,7 +271,7 @@ def predict(problem: Problem, perturbed: PerturbedLens, compensator: Given) -> P
     assembly = Assembly.of(compensator).placed(problem, perturbed.lens, perturbed.beam_radius)
     if not concrete((problem, perturbed)):
         return _predict(problem, perturbed, assembly)
-    found = _predict(quick(problem), perturbed, assembly)
+    found = _predict(problem.with_solver(solve_aimed), perturbed, assembly)
     # The full search may find rays that aiming does not find.
     if not bool(jnp.isfinite(found.nominal)):
         found = _predict(problem, perturbed, assembly)

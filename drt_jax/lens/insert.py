@@ -9,6 +9,7 @@ from collections.abc import Sequence
 
 import jax.numpy as jnp
 import numpy as np
+from jax import Array
 
 from ..inputs import require, whole_numbers
 from ..numerics import Numbers, concrete, real_array
@@ -55,26 +56,18 @@ def inserted(
     The new surfaces have the numbers `surface + 1` and `surface + 2`, and no aperture. All others
     and the sensor stay where they are. z and object distances count from the new first surface.
     """
-    (i,), gaps, dtype = whole_numbers("surface", (surface,)), lens.thickness, lens.curvature.dtype
+    (i,) = whole_numbers("surface", (surface,))
     i = -1 if i == -1 else _surface(lens, "surface", i)
     row = max(i, 0) if like is None else _surface(lens, "like", like)
-    around, sense = lens.glasses[i + 1], float(lens.senses[i + 1])
+    around = lens.glasses[i + 1]
     own = glass if isinstance(glass, int) else i + 1
     require(0 <= own <= lens.count, f"glass: expected a medium from 0 to {lens.count}, got {own}")
     name = lens.glasses[own] if isinstance(glass, int) else glass.name
     require(name != around, f"glass: {name} is behind surface {i} already")
-    given = (("distance", distance), ("thickness", thickness))
-    far, apart = (sense * real_array(name, value, dtype)[None] for name, value in given)
-    room = gaps[max(i, 0) : i + 1] - far - apart  # none in front of the first, behind the last
-    if concrete((far, apart, room)):
-        fits = bool(np.all(sense * np.concatenate([far, apart, room]) > 0))
-        what = f"distance, thickness: {distance} and {thickness} mm behind surface {i}"
-        require(fits, f"{what}: expected two numbers above 0, together less than the gap")
-    new = [far, apart, room] if i >= 0 else [apart, far]
-    thickness = jnp.concatenate([gaps[: max(i, 0)], *new, gaps[i + 1 :]])
+    gaps, added = _gaps(lens, i, distance, thickness)
     rows = [*range(i + 1), -1, -1, *range(i + 1, lens.count + 1)]
     media = [*range(i + 2), own, *range(i + 1, lens.count + 1)]
-    found, pair = reindexed(lens, rows, media, thickness), np.array([i + 1, i + 2])
+    found, pair = reindexed(lens, rows, media, gaps), np.array([i + 1, i + 2])
     names, forms = list(found.glasses), list(found.forms)
     names[i + 2], forms[i + 1], forms[i + 2] = name, lens.forms[row], lens.forms[row]
     shape = {
@@ -86,10 +79,25 @@ def inserted(
         inside = np.arange(len(names)) == i + 2
         dispersion = with_media(dispersion, inside, Dispersion.of([glass]))
     labels = Labels(lens.name, tuple(names))
-    sensor = lens.sensor + (far + apart)[0] if i < 0 else lens.sensor
+    sensor = lens.sensor + added if i < 0 else lens.sensor
     return dataclasses.replace(
         found, dispersion=dispersion, labels=labels, forms=tuple(forms), sensor=sensor, **shape
     )
+
+
+def _gaps(lens: Lens, i: int, distance: Numbers, thickness: Numbers) -> tuple[Array, Array]:
+    """Thicknesses with a pair of surfaces behind surface i, and what the pair and its distance take
+    along z; arguments and errors as in `inserted`."""
+    gaps, sense = lens.thickness, float(lens.senses[i + 1])
+    given = (("distance", distance), ("thickness", thickness))
+    far, apart = (sense * real_array(name, value, gaps.dtype)[None] for name, value in given)
+    room = gaps[max(i, 0) : i + 1] - far - apart  # none in front of the first, behind the last
+    if concrete((far, apart, room)):
+        fits = bool(np.all(sense * np.concatenate([far, apart, room]) > 0))
+        what = f"distance, thickness: {distance} and {thickness} mm behind surface {i}"
+        require(fits, f"{what}: expected two numbers above 0, together less than the gap")
+    new = [far, apart, room] if i >= 0 else [apart, far]
+    return jnp.concatenate([gaps[: max(i, 0)], *new, gaps[i + 1 :]]), (far + apart)[0]
 
 
 def removed(lens: Lens, surfaces: Sequence[int]) -> Lens:

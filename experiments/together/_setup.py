@@ -15,10 +15,10 @@ from jax import Array
 import drt_jax
 from drt_jax import Lens, Scene, design, learn
 from drt_jax.design.optimum import init_problem, take_step
-from drt_jax.design.problem import quick
 from drt_jax.devices import shared
 from drt_jax.learn.data import Patches
 from drt_jax.learn.field import FieldImager, ObjectPoints, draw_points, make_field_step
+from drt_jax.rays.solve import solve_aimed
 
 from . import _common
 from ._sharing import mesh_of
@@ -247,7 +247,7 @@ class Setup:
     def rates(self) -> Array:
         """Adam's rate of each variable: at the spoilt lens it changes the spots by as much as all
         others, `train.optics_rate`, root mean square over rays, fields and depths."""
-        tried = quick(self.spots)
+        tried = self.spots.with_solver(solve_aimed)
         search = take_step(tried, init_problem(tried, self.spoilt))
         rows = search.residuals.size - search.evaluation.constraints.size
         views = len(tried.fields) * len(tried.distances)

@@ -12,7 +12,7 @@ from drt_jax import Clipped, Gauss, Scene, design, load_lens
 from drt_jax.compilation import LARGE, jit
 from drt_jax.design import OPERANDS, Operand, Problem, Variables, Vary, trace_fields
 from drt_jax.design.failures import failures
-from drt_jax.design.problem import quick
+from drt_jax.rays.solve import solve_aimed
 
 from .test_operands import COLOURS, model
 
@@ -61,7 +61,7 @@ def crooked(tmp_path_factory):
     )
     moves = np.random.default_rng(0).normal(size=len(variables.places))
     # As optimisers search: a third of the program, and the derivatives do not know.
-    return quick(problem), variables.start + moves
+    return problem.with_solver(solve_aimed), variables.start + moves
 
 
 @pytest.mark.slow
@@ -163,7 +163,8 @@ def test_random_lenses_are_never_nan(strong):
     as they are searched in full."""
     problem, x = strong
     both, full = (
-        jit(jax.vmap(jax.value_and_grad(p.merit)), LARGE) for p in (quick(problem), problem)
+        jit(jax.vmap(jax.value_and_grad(p.merit)), LARGE)
+        for p in (problem.with_solver(solve_aimed), problem)
     )
     rng = np.random.default_rng(0)
     sizes = 10 ** rng.uniform(-1, 1.5, (64, 1))

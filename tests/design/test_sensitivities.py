@@ -2,6 +2,7 @@
 
 import csv
 import dataclasses
+import functools
 from typing import get_args
 
 import jax
@@ -167,6 +168,15 @@ def test_a_lens_that_fails_never_looks_good(singlet):
     assert found[0] == pytest.approx(1) and found[1] == -np.inf
     np.testing.assert_allclose(design.yields(found, [0.9, 0.0], light), 0.5)
     assert design.monte_carlo(problem, some, off, "focus").value[1] == np.inf
+
+
+@pytest.mark.slow
+def test_a_lens_that_fails_without_errors_is_refused(singlet):
+    problem, some = singlet
+    wide = dataclasses.replace(problem, fields=jnp.array([[0.0, 0.0], [0.0, 1.5]]))
+    for ask in (design.sensitivity, functools.partial(design.inverse_sensitivity, drop=1e-3)):
+        with pytest.raises(ValueError, match="without errors rays of the lens fail"):
+            ask(wide, some, compensator="none")
 
 
 def some_table():

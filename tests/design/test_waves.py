@@ -11,8 +11,8 @@ import drt_jax
 from drt_jax import Clipped, Gauss, Pattern, Scene, Soft, design, learn, load_lens
 from drt_jax.compilation import LARGE, jit
 from drt_jax.design import Operand, Problem, Variables, Vary, trace_fields
-from drt_jax.design.problem import quick
 from drt_jax.image.beam import beam_rule
+from drt_jax.rays.solve import solve_aimed
 
 from ..image.test_encircled import ZEROS
 from ..image.test_transfer import CIRCLE, COOKE, LIMIT, MIRROR, PARTS, WAVE
@@ -29,7 +29,7 @@ ASKED = [
 
 def told(problem, lens):
     """Values of all operands by name; rays are aimed, a third of the program of a search."""
-    rays = trace_fields(quick(problem), lens)
+    rays = trace_fields(problem.with_solver(solve_aimed), lens)
     return {operand.name: operand.values(lens, rays) for operand in problem.operands}
 
 
@@ -106,7 +106,7 @@ def test_kernels_are_those_of_psf():
 
     def beside(x):
         lens = variables.lens_of(x)
-        rays = trace_fields(quick(problem), lens)
+        rays = trace_fields(problem.with_solver(solve_aimed), lens)
         kernels = design.psf(lens, rays, 4e-3, 9).kernel
         return jnp.sum(1 - kernels[:, :, 4, 4]), (kernels, rays.rule)
 
