@@ -93,7 +93,7 @@ def test_lenses_as_built_are_searched_in_full(monkeypatch):
         found = find_aimed(system, target)
         return found._replace(status=jnp.full_like(found.status, drt_jax.Status.UNCONVERGED))
 
-    monkeypatch.setattr("drt_jax.design.problem.solve_aimed", blind)
+    monkeypatch.setattr("drt_jax.design.tolerance.solve_aimed", blind)
     found = design.monte_carlo(problem, perturbed, off, "focus")
     np.testing.assert_allclose(found.squares, wanted.squares, rtol=1e-9)
 
@@ -113,7 +113,8 @@ def test_an_optimum_is_searched_in_full(monkeypatch):
         failed = jnp.where(edge[None], drt_jax.Status.UNCONVERGED, found.status)
         return found._replace(status=failed.astype(jnp.int32))
 
-    monkeypatch.setattr("drt_jax.design.problem.solve_aimed", blind)
+    monkeypatch.setattr("drt_jax.design.optimum.solve_aimed", blind)
+    monkeypatch.setattr("drt_jax.design.starts.solve_aimed", blind)
     found = design.optimise(problem)
     np.testing.assert_allclose(found.merit, wanted.merit, rtol=1e-9)
     starts = design.normal_starts(variables, 4, 1.0)
