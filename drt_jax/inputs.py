@@ -5,6 +5,7 @@ Everything else is refused with its line number: aliases (a few of them can expa
 tags, second documents, and duplicate keys (other readers take the last one).
 """
 
+import difflib
 import os
 import reprlib
 import stat
@@ -83,7 +84,15 @@ def require_tolerance(sampling: Any) -> float:
 def require_one_of(what: str, value: object, known: Iterable[str]) -> None:
     """Raises ValueError, which lists the known words, for a value that is none of them."""
     words = [*known]
-    require(value in words, f"{what}: expected one of {', '.join(words)}, got {shown(value)}")
+    some = f"{what}: expected one of {', '.join(words)}, got {shown(value)}"
+    require(value in words, some + nearest(value, words))
+
+
+def nearest(value: object, known: Iterable[str]) -> str:
+    """What a message adds where a word looks like one that is known, such as "; did you mean
+    'spot'?"."""
+    close = difflib.get_close_matches(str(value)[:40].lower().replace("-", "_"), known, n=1)
+    return f"; did you mean {close[0]!r}?" if close else ""
 
 
 def whole_numbers(what: str, given: Any) -> tuple[int, ...]:

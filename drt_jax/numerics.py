@@ -23,6 +23,9 @@ EXACT = jax.lax.Precision.HIGHEST
 einsum = functools.partial(jnp.einsum, precision=EXACT)
 matmul = functools.partial(jnp.matmul, precision=EXACT)
 tensordot = functools.partial(jnp.tensordot, precision=EXACT)
+# Compiles a function when it is called outside of `jit`, instead of each of its operations alone;
+# inside it becomes a part of that program.
+program = functools.partial(jax.jit, inline=True)
 if TYPE_CHECKING:
     Numbers = ArrayLike | Sequence[ArrayLike] | Sequence[Sequence[ArrayLike]]
 else:

@@ -2,6 +2,8 @@
 
 import re
 import signal
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -204,7 +206,8 @@ def test_ctrl_c_is_one_line(monkeypatch, capsys):
 @pytest.mark.parametrize(
     "words, message",
     [
-        (["show", "nothing"], "no bundled lens 'nothing'"),
+        (["show", "nothing"], "no bundled lens 'nothing'; bundled"),
+        (["show", "double-gauss"], "'double-gauss'; did you mean 'double_gauss'?; bundled"),
         (["show", "singlet", "--field", "90"], "--field: must be within 90 degrees"),
         (["show", "singlet", "--distance", "0"], "distance: must be 1e-06 mm or more"),
         (["show", "singlet", "--wavelengths", "9"], "outside the range"),
@@ -217,6 +220,15 @@ def test_errors_are_one_line(words, message, tmp_path, capsys):
         main([*words, *(["--out", str(tmp_path / "lens.png")] if words[0] == "show" else [])])
     said = capsys.readouterr().err
     assert ended.value.code == 2 and message in said and said.count("\n") == 1
+
+
+def test_a_reader_that_has_enough_is_no_error():
+    """As `head`: nothing is said of a pipe that is closed."""
+    words = [sys.executable, "-m", "drt_jax", "glass", "SF53"]
+    with subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as run:
+        run.stdout.close()
+        assert run.stderr.read() == b""
+    assert run.returncode == 1
 
 
 def test_a_glass_shows_itself(tmp_path, capsys):

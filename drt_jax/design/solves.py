@@ -4,7 +4,6 @@ exactly.
 
 import copy
 import dataclasses
-import functools
 import math
 from collections.abc import Callable, Sequence
 from typing import Any, Literal, NamedTuple, get_args
@@ -20,7 +19,7 @@ from ..inputs import require, require_one_of
 from ..lens.lens import Lens
 from ..lens.paraxial import entrance_pupil, marginal_ray, paraxial_system, trace_ray
 from ..lens.scene import Scene, checked_scene, vergence_of
-from ..numerics import concrete, leaves, safe_divide
+from ..numerics import concrete, leaves, program, safe_divide
 from ..pupil.rules import Gauss
 from ..rays.solve import solve_aimed
 from .field_rays import symmetry_by_structure
@@ -37,8 +36,6 @@ _Name = Literal[
     "paraxial_focus",
     "best_focus",
 ]
-# Functions are compiled when called outside of `jit`; inside they become a part of its program.
-_program = functools.partial(jax.jit, inline=True)
 # Number of Newton steps. Every condition is linear in the solved number, so that one step solves
 # it; the second step removes rounding errors.
 _STEPS = 2
@@ -180,7 +177,7 @@ class Solve:
             return 1 / value if value else math.inf
         return safe_divide(jnp.ones_like(value), value)
 
-    @_program
+    @program
     def rate(self, lens: Lens, other: "Solve") -> Array:
         """Derivative () of this condition by the solved number of another solve."""
         number, with_number = number_at(lens, other.place(lens))
@@ -212,13 +209,13 @@ def fix_solves(lens: Lens, solves: Sequence[Solve]) -> tuple[tuple[Solve, ...], 
     return tuple(solve.placed(lens) for solve in found), lens
 
 
-@_program
+@program
 def _measure(lens: Lens, solve: Solve) -> Array:
     """The measure () of a condition, see `_Condition`."""
     return _CONDITIONS[solve.kind].measure(lens, solve)
 
 
-@_program
+@program
 def _met(lens: Lens, solve: Solve) -> Array:
     """The solved number (), by Newton's method on measure - value = 0."""
     number, with_number = number_at(lens, solve.place(lens))
@@ -278,7 +275,7 @@ _CONDITIONS = {
 }
 
 
-@_program
+@program
 def _focus(lens: Lens, solve: Solve) -> tuple[Array, Array]:
     """The focus, for the mean over wavelengths.
 

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from ..inputs import parse, read_text, require_one_of, shown
+from ..inputs import nearest, parse, read_text, require_one_of, shown
 from ..lens.lens import Lens
 from ..lens.paraxial import FirstOrder, first_order, image_height
 from ..lens.scene import Scene, field_of_height
@@ -122,7 +122,8 @@ def load_lens(
         path = pathlib.Path(source)
         if str(source) in lens_names():
             path = _BUNDLED / f"{source}.yaml"
-        what = f"no bundled lens {shown(str(source))}; bundled: {', '.join(lens_names())}"
+        meant = nearest(source, lens_names())
+        what = f"no bundled lens {shown(str(source))}{meant}; bundled: {', '.join(lens_names())}"
         remedy = f"for a file of your own give a path that ends in {', '.join(_ENDINGS)}"
         require(path.suffix, f"{what}; {remedy}")
         if known_ending(path) in _READERS:

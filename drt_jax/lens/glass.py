@@ -9,7 +9,7 @@ import numpy as np
 from jax import Array
 
 from ..inputs import require
-from ..numerics import concrete, matmul, safe_divide, safe_sqrt
+from ..numerics import concrete, matmul, program, safe_divide, safe_sqrt
 
 # Of model glasses: the lines d, F, C, g (um), and the powers of the wavelength L in Conrady's
 # formula.
@@ -195,6 +195,7 @@ def _model_index(model: Array, partial: Array | None, wavelengths: Array) -> Arr
     return matmul(matmul(own, jnp.asarray(formula, known.dtype)), powers)
 
 
+@program
 def refractive_index(dispersion: Dispersion, wavelengths: Array) -> Array:
     """Index of each medium at each wavelength, (M, W), relative to air, whose index is 1.
 

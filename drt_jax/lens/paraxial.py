@@ -12,6 +12,7 @@ degrees or more.
 """
 
 import dataclasses
+import functools
 from typing import Any, NamedTuple
 
 import jax
@@ -19,7 +20,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from ..numerics import Numbers, safe_divide, still
+from ..numerics import Numbers, program, safe_divide, still
+from .glass import refractive_index
 from .lens import Lens
 from .scene import ahead, away_from_vertex, distance_array, known_angles, vergence_of
 from .surface import vertex_curvature
@@ -110,6 +112,7 @@ def trace_yu(
     return jax.lax.scan(step, ray, (gaps, power, index[:-1], index[1:]))[1]
 
 
+@jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class ParaxialSystem:
     """A lens for paraxial rays.
@@ -129,7 +132,7 @@ class ParaxialSystem:
     index: Array
     aperture: Array
     known: Array
-    stop: int
+    stop: int = dataclasses.field(metadata={"static": True})
 
     def masked(self, results: Any, good: Array | bool = True) -> Any:
         """Results with inf where an index is not known or the input is invalid.
@@ -158,8 +161,13 @@ class ParaxialRay(NamedTuple):
 def paraxial_system(lens: Lens, wavelengths: Numbers) -> ParaxialSystem:
     """The lens for paraxial rays. wavelengths: (W,), um."""
     lens.check()
-    waves = lens.checked_wavelengths(wavelengths)
-    index = lens.index(jnp.clip(waves, *lens.dispersion.range))
+    return _system(lens, lens.checked_wavelengths(wavelengths))
+
+
+@program
+def _system(lens: Lens, waves: Array) -> ParaxialSystem:
+    """`paraxial_system` of checked numbers."""
+    index = refractive_index(lens.dispersion, jnp.clip(waves, *lens.dispersion.range))
     index = index * jnp.asarray(lens.senses[:, None], index.dtype)
     curvature = vertex_curvature(lens.shape, lens.forms, 1)[0][:-1]
     power = curvature[:, None] * jnp.diff(index, axis=0)
@@ -172,6 +180,7 @@ def paraxial_system(lens: Lens, wavelengths: Numbers) -> ParaxialSystem:
     return ParaxialSystem(curvature, power, lens.thickness, index, aperture, known, lens.stop)
 
 
+@program
 def trace_ray(system: ParaxialSystem, height: Array | float, slope: Array | float) -> ParaxialRay:
     """Traces the paraxial ray of a height (mm) and slope, () or (W,), in front of the first vertex.
 
@@ -192,6 +201,7 @@ def trace_ray(system: ParaxialSystem, height: Array | float, slope: Array | floa
     return ParaxialRay(heights, before, behind.at[-1].add(-error))
 
 
+@functools.partial(program, static_argnames="front")
 def chief_ray(system: ParaxialSystem, front: bool) -> tuple[Array, Array]:
     """Height (W,), mm, and slope (W,) of the ray through the centre of the stop with n u = 1 there.
 
@@ -212,6 +222,7 @@ def chief_ray(system: ParaxialSystem, front: bool) -> tuple[Array, Array]:
     return (-height, slope) if front else (height, slope)
 
 
+@functools.partial(program, static_argnames="front")
 def _pupil(system: ParaxialSystem, front: bool) -> Pupil:
     """The entrance pupil (`front`) or the exit pupil."""
     height, slope = chief_ray(system, front)
@@ -229,6 +240,7 @@ def entrance_pupil(lens: Lens, wavelengths: Numbers) -> Pupil:
     return _pupil(paraxial_system(lens, wavelengths), front=True)
 
 
+@program
 def marginal_ray(system: ParaxialSystem, vergence: Array) -> ParaxialRay:
     """The ray from the axial object point through the rim of the stop.
 
@@ -253,7 +265,12 @@ def first_order(lens: Lens, distance: Numbers, wavelengths: Numbers) -> FirstOrd
     wavelengths: (W,), um.
     """
     system = paraxial_system(lens, wavelengths)
-    far = distance_array(distance, lens.curvature.dtype)
+    return _first_order(system, distance_array(distance, lens.curvature.dtype))
+
+
+@program
+def _first_order(system: ParaxialSystem, far: Array) -> FirstOrder:
+    """`first_order` of an object at the distance `far`, mm."""
     vergence, index = vergence_of(far), system.index
     level, slanted = trace_ray(system, 1.0, 0.0), trace_ray(system, 0.0, 1.0)
     axial = trace_ray(system, 1.0, vergence)
@@ -286,7 +303,12 @@ def focal_length(lens: Lens, wavelengths: Numbers) -> Array:
     lens: the lens.
     wavelengths: (W,), um.
     """
-    system = paraxial_system(lens, wavelengths)
+    return _focal_length(paraxial_system(lens, wavelengths))
+
+
+@program
+def _focal_length(system: ParaxialSystem) -> Array:
+    """`focal_length` of a paraxial system."""
     slope = trace_ray(system, 1.0, 0.0).behind[-1]
     return system.masked(_quotient(-jnp.ones_like(slope), slope))
 
