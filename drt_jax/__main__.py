@@ -22,7 +22,7 @@ import numpy as np
 from .check.run import kept_programs, machine, report, rows
 from .check.truth import TRUTHS
 from .compilation import ONCE, jit, keep_programs
-from .files.load import System, lens_names, load_lens, load_system
+from .files.load import lens_names, load_lens, load_system
 from .files.write import save_lens
 from .image.converged import psf_moments
 from .image.diagnose import crossed
@@ -44,6 +44,7 @@ _LINES = (0.6562725, 0.5875618, 0.4861327)  # C, d, F
 # Orders of the two rules for the spots; a larger relative difference of spot size is reported.
 _ORDERS, _TOLERANCE = (14, 20), 1e-3
 _MISSING = "warn: leave out what the package has not and rays can go on without, and say so"
+_OTHERS = (".zmx", ".seq")
 _DEFOCUS = 3.0  # a spot larger than this many times the smallest spot is out of focus
 _WAVES = 5  # of more wavelengths of a file, the primary, longest and shortest are shown
 _NO_SIZE = 1e-9  # mm, mrad: a smaller spot is only rounding error
@@ -232,21 +233,31 @@ def _show_task(what: str) -> None:
 
 def run_convert(options: argparse.Namespace) -> None:
     """Writes a lens in another format, and prints which data the new file leaves out."""
-    kind = pathlib.Path(options.lens).suffix.lower()
-    load = load_system if kind in (".zmx", ".seq") else load_lens
+    read, write = (pathlib.Path(p).suffix.lower() in _OTHERS for p in (options.lens, options.out))
+    load, given = load_system if read else load_lens, (options.lens, options.missing)
+    whole = read and write and options.configuration is None  # with all configurations
     with _warnings_on_stdout():
-        found = load(options.lens, options.missing, options.configuration)
+        first = load(*given, 1 if whole else options.configuration)
+        lens, count = (first, 1) if isinstance(first, Lens) else (first.lens, first.configurations)
+        found = [first, *(load(*given, k + 1) for k in range(1, count if whole else 1))]
         save_lens(found, options.out)
-    lens = found.lens if isinstance(found, System) else found
-    _write([f"{lens.name or 'the lens'}, {lens.count} surfaces, is written to {options.out}"])
+    what = f"{len(found)} configurations, " if found[1:] else ""
+    _write([f"{lens.name or 'the lens'}, {what}{lens.count} surfaces, is written to {options.out}"])
 
 
 @contextlib.contextmanager
 def _warnings_on_stdout() -> Iterator[None]:
-    """Prints every warning as a line."""
+    """Prints every warning as a line, once."""
     with warnings.catch_warnings():
         warnings.simplefilter("always")
-        warnings.showwarning = lambda message, *_, **__: _print_line(f"  ! {message}")
+        said = set()
+
+        def show(message: Warning | str, *_: object, **__: object) -> None:
+            if str(message) not in said:
+                said.add(str(message))
+                _print_line(f"  ! {message}")
+
+        warnings.showwarning = show
         yield
 
 
@@ -267,7 +278,7 @@ def _view(options: argparse.Namespace) -> _View:
     """What the options and a file ask for. Options override the values of a .zmx or .seq file."""
     fields, distance, waves, note = [0.0, 7.0, 10.0], math.inf, list(_LINES), ""
     weights = {wave: 1.0 for wave in waves}
-    if pathlib.Path(options.lens).suffix.lower() in (".zmx", ".seq"):
+    if pathlib.Path(options.lens).suffix.lower() in _OTHERS:
         system = load_system(options.lens, options.missing, options.configuration)
         lens, distance = system.lens, system.distance
         primary = float(system.wavelengths[system.primary])

@@ -36,6 +36,8 @@ gc.set_threshold(100_000, 20, 20)
 
 # All slow tests take longer than CI may: it runs another seventh of them for another commit.
 PARTS = 7
+# Files whose cases share no programs: these, too, are apart.
+APART = ("test_pages.py", "test_starts.py")
 LONGEST = ("test_readme.py", "test_experiments.py", "test_derivatives.py")
 RGB = (0.6, 0.53, 0.48)
 LENSES = ("double_gauss", "double_gauss_addon", "cooke_triplet", "singlet")
@@ -58,12 +60,13 @@ def pytest_configure(config):
 
 def pytest_collection_modifyitems(config, items):
     """Files with long tests first: none is left for one worker alone at the end. With `--part`,
-    every seventh slow function; the cases of one share programs."""
+    every seventh slow function; the cases of one share programs, but for those of `APART`."""
     items.sort(key=lambda item: item.path.name not in LONGEST)
     part = config.getoption("--part")
     if part is None:
         return
-    slow = {i: (i.path, i.originalname) for i in items if i.get_closest_marker("slow")}
+    own = {i: i.name if i.path.name in APART else i.originalname for i in items}
+    slow = {i: (i.path, own[i]) for i in items if i.get_closest_marker("slow")}
     wanted = set(itertools.islice(dict.fromkeys(slow.values()), part, None, PARTS))
     left = [item for item, function in slow.items() if function not in wanted]
     config.hook.pytest_deselected(items=left)

@@ -46,13 +46,13 @@ ALLOWED_ALL = {"learn.__init__", *(f"show.{name}" for name in (*_DRAWN, "toleran
 # Most lines of code of each room; no blank, comment, docstring or import is counted. They
 # fall, and rise only by a new capability, whose commit says by how much: text is free, code is not.
 ROOMS = {
-    "drt_jax": 562,
+    "drt_jax": 580,
     "drt_jax/check": 298,
-    "drt_jax/design": 3218,
-    "drt_jax/files": 3017,
+    "drt_jax/design": 3217,
+    "drt_jax/files": 3110,
     "drt_jax/image": 3043,
     "drt_jax/learn": 656,
-    "drt_jax/lens": 1566,
+    "drt_jax/lens": 1578,
     "drt_jax/pupil": 776,
     "drt_jax/rays": 1314,
     "drt_jax/show": 1178,

@@ -14,7 +14,7 @@ from jax import Array
 
 from ..inputs import nearest, parse, read_text, require_one_of, shown
 from ..lens.lens import Lens
-from ..lens.paraxial import FirstOrder, first_order, image_height
+from ..lens.paraxial import FirstOrder, entrance_pupil, first_order, image_height
 from ..lens.scene import Scene, field_of_height
 from .agf import load_agf
 from .entry import LensError, require
@@ -68,6 +68,31 @@ class System:
     notes: tuple[str, ...] = ()
     configurations: int = 1
     configuration: int = 1
+
+    @classmethod
+    def of(cls, lens: Lens, scene: Scene) -> "System":
+        """A lens with the fields, distance, wavelengths and weights of a scene, for `save_lens`.
+
+        In a file, the fields are angles, seen from the entrance pupil as in other programs; heights
+        of the object for a telecentric lens. The primary wavelength is that in the middle.
+
+        ValueError unless the scene has one distance.
+        """
+        fields = np.asarray(scene.field, float).reshape(-1, 2)
+        waves, weights = np.asarray(scene.wavelengths, float), scene.wavelength_weights
+        distances = np.unique(np.asarray(scene.distance, float))
+        require(len(distances) == 1, "scene: a file has one distance; make a system for each")
+        primary = int(np.argsort(waves)[len(waves) // 2])
+        far = abs(distances[0]) if np.isinf(distances[0]) else distances[0]
+        place = float(entrance_pupil(lens, waves[primary]).position[0])
+        kind: FieldKind = "angle" if math.isfinite(place) else "object height"
+        ratio = far / (far + place) if math.isfinite(far) else 1.0
+        seen = np.degrees(np.arctan(ratio * np.tan(fields)))
+        heights = seen if kind == "angle" else -far * np.tan(fields)
+        both = ((scene.field_weights, fields), (weights, waves))
+        own, parts = (np.ones(len(of)) if a is None else np.asarray(a, float) for a, of in both)
+        use = (heights, kind, own, np.zeros((len(fields), 5)), waves, parts, primary, None, None)
+        return cls(lens, float(far), fields, *use)
 
     @property
     def scene(self) -> Scene:
@@ -144,13 +169,15 @@ def known_ending(path: str | pathlib.Path) -> str:
     return kind
 
 
-def lens_in(text: str, path: str | pathlib.Path) -> tuple[Lens, dict[str, Any]]:
+def lens_in(
+    text: str, path: str | pathlib.Path, configuration: int | None = None
+) -> tuple[Lens, dict[str, Any]]:
     """The lens of the text of a file, and of its use the fields of `System` that need no ray; none
     of a prescription. LensError as of `load_lens`. path: its name."""
     kind = known_ending(path)
     if kind not in _READERS:
         return _lens_of_yaml(text, pathlib.Path(path)), {}
-    record = _READERS[kind](str(path), "error", text.splitlines())
+    record = _READERS[kind](str(path), "error", text.splitlines(), configuration)
     return _lens_of(record), _of_system(record.use) | {"distance": record.distance}
 
 

@@ -2,7 +2,7 @@
 
 import pathlib
 import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -24,7 +24,7 @@ _WEIGHTED = ("heights", "field_weights", "vignetting", "wavelengths", "wavelengt
 _CLOSE = 1e-9  # relative, and in mm, of what is read back; rounding of float32 is larger
 
 
-def save_lens(lens: Lens | System, path: str | pathlib.Path) -> None:
+def save_lens(lens: Lens | System | Sequence[Lens | System], path: str | pathlib.Path) -> None:
     """Write a lens as a YAML prescription, or as a file of Zemax or CODE V if the path ends in
     `.zmx` or `.seq`. `load_lens` reads the same lens from it, to the last digit (tilts, which files
     hold in degrees, and model glasses and radii in `.zmx`: to the last digit but one).
@@ -35,46 +35,65 @@ def save_lens(lens: Lens | System, path: str | pathlib.Path) -> None:
     glasses that differ from the catalogue's. A second medium of the same name with other constants
     is called name*.
 
-    lens: a lens; or a `System`, whose fields, wavelengths, vignetting and distance of the object
-        stand in `.zmx` and `.seq` files, with the size of the stop; a lens alone is written with an
-        axial field at infinity and the d line. A warning tells what `.yaml` has not.
+    lens: a lens; or a `System`, as `System.of(lens, scene)`, whose fields, wavelengths, weights,
+        vignetting and distance of the object stand in `.zmx` and `.seq` files, with the size of the
+        stop; a lens alone is written with an axial field at infinity and the d line. A warning
+        tells what `.yaml` has not. Several systems are configurations (zoom positions) of one lens,
+        which differ in numbers: rows behind MNUM, ZOO.
     path: of the file, which is overwritten; it ends in `.yaml`, `.yml`, `.zmx` or `.seq`.
 
     LensError for another ending, if the file cannot hold the lens, such as a prescription a curved
     sensor, if `Lens.check` or `load_lens` refuse it, or if the file cannot be written.
     """
     kind = known_ending(path)
-    system = lens if isinstance(lens, System) else system_for(lens)
-    if kind in (".yaml", ".yml") and isinstance(lens, System):
-        warn(f"{path}: fields, wavelengths and vignetting are not written")
+    given = [lens] if isinstance(lens, Lens | System) else [*lens]
+    require(given, "lens: expected a lens, a system, or several systems, got none")
+    systems = [own if isinstance(own, System) else system_for(own) for own in given]
+    if kind in (".yaml", ".yml"):
+        require(
+            len(systems) == 1, f"{path}: a prescription has one configuration: write .zmx, .seq"
+        )
+        if isinstance(given[0], System):
+            warn(f"{path}: fields, wavelengths and vignetting are not written")
     try:
-        text = {".zmx": zmx_text, ".seq": seq_text}.get(kind, _yaml_text)(system)
-        system.lens.check()
+        text = {".zmx": zmx_text, ".seq": seq_text}.get(kind, _yaml_text)(systems)
+        for system in systems:
+            system.lens.check()
     except LensError:
         raise
     except ValueError as error:
         raise LensError(f"{path}: not written: {error}") from error
-    low, high = system.lens.dispersion.range
-    waves = dict.fromkeys([*FRAUNHOFER[:3], *system.wavelengths.tolist()])
-    known = [wave for wave in waves if low <= wave <= high]
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            again, used = lens_in(text, path)
-    except LensError as error:
-        raise LensError(f"{error}; not written, as it could not be read back") from error
-    # A private glass of .seq stands for a model glass by six terms.
-    room = _PRIVATE if kind == ".seq" and system.lens.dispersion.model is not None else 0.0
-    found = _difference(system.lens, again, known, room) or _use_difference(system, used)
-    require(not found, f"{path}: not written: what is read back differs: {found}")
+    for k, system in enumerate(systems):
+        _read_back(system, text, path, k + 1 if len(systems) > 1 else None)
     try:
         pathlib.Path(path).write_text(text, encoding="utf-8")
     except OSError as error:
         raise LensError(f"{path}: cannot be written: {error.strerror}") from error
 
 
-def _yaml_text(system: System) -> str:
-    lens = system.lens
+def _read_back(
+    system: System, text: str, path: str | pathlib.Path, configuration: int | None
+) -> None:
+    """LensError if the text of a file does not read back as this system."""
+    low, high = system.lens.dispersion.range
+    waves = dict.fromkeys([*FRAUNHOFER[:3], *system.wavelengths.tolist()])
+    known = [wave for wave in waves if low <= wave <= high]
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            again, used = lens_in(text, path, configuration)
+    except LensError as error:
+        raise LensError(f"{error}; not written, as it could not be read back") from error
+    # A private glass of .seq stands for a model glass by six terms.
+    private = known_ending(path) == ".seq" and system.lens.dispersion.model is not None
+    room = _PRIVATE if private else 0.0
+    found = _difference(system.lens, again, known, room) or _use_difference(system, used)
+    where = f" in configuration {configuration}" if configuration else ""
+    require(not found, f"{path}: not written: what is read back{where} differs: {found}")
+
+
+def _yaml_text(systems: Sequence[System]) -> str:
+    lens = systems[0].lens
     curved = any(np.asarray(part)[-1] for part in (lens.curvature, lens.conic))
     require(not curved, "sensor: a prescription has none that is curved")
     top: dict[str, Any] = {"name": lens.name} if lens.name else {}

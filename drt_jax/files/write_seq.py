@@ -1,8 +1,9 @@
 """Write a lens as a CODE V `.seq` file, the inverse of `seq`."""
 
+import bisect
 import math
 import textwrap
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import jax.numpy as jnp
@@ -24,11 +25,12 @@ from ..lens.paraxial import entrance_pupil
 from .entry import LensError, require
 from .load import System
 from .record import turns_of
-from .seq import FIELDS
+from .seq import FIELDS, VIGNETTING
 from .seq_glass import folded, schott_through
 from .seq_surfaces import LETTERS, MOVES, RADIAL, SIZES
 from .written import (
     degrees_of,
+    differing,
     element_of,
     entry_of,
     gap_behind,
@@ -48,9 +50,39 @@ _SPECIAL = {
 _STILL = 1e-12  # mm, radians: below this a surface stands on the axis of the one before it
 
 
-def seq_text(system: System) -> str:
-    """The text of a file. LensError, with the remedy, for features that are not written; a warning
-    tells how far a model glass differs that becomes a private one."""
+def seq_text(systems: Sequence[System]) -> str:
+    """The text of a file of one zoom position or more. LensError, with the remedy, for features
+    that are not written; a warning tells how far a model glass differs that becomes a private one.
+    """
+    texts = [_lines(system) for system in systems]
+    whole = ["\n".join(lines).replace(" &\n", " ").split("\n") for lines in texts]
+    return "\n".join([*texts[0], *_zooms(whole), "GO", ""])
+
+
+def _zooms(texts: Sequence[Sequence[str]]) -> list[str]:
+    """The commands of what differs between zoom positions, of the lines of each."""
+    found = [f"ZOO {len(texts)}"] if len(texts) > 1 else []
+    starts = [n for n, line in enumerate(texts[0]) if line.startswith("S")]
+    for n, words, at, values in differing(texts):
+        surface, key = bisect.bisect_right(starts, n) - 1, words[0]
+        place = "SI" if surface == len(starts) - 1 else f"S{surface}"
+        if key in ("S", "SO", "SI") and at in (1, 2):
+            command = f"{'CUY' if at == 1 else 'THI'} {place}"
+        elif surface >= 0 and len(words) == 2 and at == 1:
+            command = f"{key} {place}"
+        elif key in ("WL", "WTW") or key[1:] in FIELDS or key in (*VIGNETTING, "WTF"):
+            command = f"{key} {'W' if key in ('WL', 'WTW') else 'F'}{at}"
+        elif key == "EPD":
+            command = key
+        else:
+            some = f"{' '.join(words)[:40]}, {' and '.join(values)}"
+            raise LensError(f"zoom positions differ in {some}, which is not written")
+        found += _wrapped(f"ZOO {command}", values)
+    return found
+
+
+def _lines(system: System) -> list[str]:
+    """The lines of one zoom position before GO."""
     lens, worst = system.lens, 0.0
     what = ".seq files hold no afocal image space here: save as .yaml or .zmx"
     require(not lens.afocal, what)
@@ -85,7 +117,7 @@ def seq_text(system: System) -> str:
     lines.append(f"SI {float(lens.curvature[-1])!r} 0.0")
     conic = float(lens.conic[-1])
     lines += [f"  {line}" for line in [*(["CON", f"K {conic!r}"] if conic else []), *places[-1]]]
-    return "\n".join([*lines, "GO", ""])
+    return lines
 
 
 def _use(system: System) -> list[str]:

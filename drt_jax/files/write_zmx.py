@@ -1,7 +1,7 @@
 """Write a lens as a `.zmx` file, the inverse of `zmx`."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, get_args
 
 import numpy as np
@@ -23,6 +23,7 @@ from .written import (
     shapes_of,
 )
 from .zmx import BESIDE, COLUMNS
+from .zmx_configurations import rows
 from .zmx_surfaces import APERTURES
 
 _HEAD = """VERS 150514 0 0
@@ -50,8 +51,15 @@ _SERIES = {  # by form: type whose XDAT hold the coefficients
 _OTHERS = {"silica": "F_SILICA"}
 
 
-def zmx_text(system: System) -> str:
-    """The text of a file. LensError, with the remedy, for features that are not written."""
+def zmx_text(systems: Sequence[System]) -> str:
+    """The text of a file of one configuration or more. LensError, with the remedy, for features
+    that are not written."""
+    texts = [_lines(system) for system in systems]
+    return "\n".join([*texts[0], *rows(texts), ""])
+
+
+def _lines(system: System) -> list[str]:
+    """The lines of one configuration before MNUM."""
     lens = system.lens
     media = [medium_of(lens, i) or {} for i in range(lens.count + 1)]
     makers, names = written_names([own["glass"] for own in media if "glass" in own])
@@ -70,7 +78,7 @@ def zmx_text(system: System) -> str:
     placed = ([*own, f"DISZ {gap!r}"] for own, gap in zip(blocks, [*behind, 0.0], strict=True))
     for i, block in enumerate([front, *placed]):
         lines += [f"SURF {i}", *(f"  {line}" for line in block)]
-    return "\n".join([*lines, "MNUM 1 1", ""])
+    return lines
 
 
 def _use(system: System) -> list[str]:

@@ -1,7 +1,7 @@
 """A lens as entries of a prescription, from which all kinds of files are written."""
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
 import jax.numpy as jnp
@@ -185,3 +185,21 @@ def media_of_lens(lens: Lens) -> tuple[list[dict[str, Any]], dict[str, Any]]:
             keys = {"glass": name}
         media.append(keys)
     return media, glasses
+
+
+def differing(
+    texts: Sequence[Sequence[str]],
+) -> Iterator[tuple[int, list[str], int, list[str]]]:
+    """The words that differ between the lines of C configurations of one lens, without its name:
+    number of the line, its words in the first configuration, number of the word, the C words.
+    LensError if the lines themselves are others."""
+    what = "configurations differ in more than numbers: other glasses, forms, fields or apertures"
+    require(len({*map(len, texts)}) == 1, what)
+    for n, lines in enumerate(zip(*texts, strict=True)):
+        words = [line.split() for line in lines]
+        if words[0][0] in ("NAME", "TITLE"):
+            continue
+        require(len({*map(len, words)}) == 1, f"{what}: {lines[0].strip()[:80]}")
+        for at, values in enumerate(zip(*words, strict=True)):
+            if len({*values}) > 1:
+                yield n, words[0], at, [*values]

@@ -4,7 +4,12 @@ The surfaces and the header have the numbers of the current configuration. The r
 are written over them before they are read.
 """
 
+import bisect
+from collections.abc import Sequence
+
+from .entry import LensError
 from .record import Record, Words
+from .written import differing
 
 # The keyword of a surface, of a list over fields and of the entry of a wavelength that a row
 # changes.
@@ -84,3 +89,27 @@ def _write(record: Record, found: list[Words], row: Words) -> None:
                 words.values[:1] = [value]
     else:
         record.lacks(row.line, f"{key}, which differs between configurations")
+
+
+def rows(texts: Sequence[Sequence[str]]) -> list[str]:
+    """The lines from MNUM on, of the lines of a file for each configuration. LensError for lines
+    that differ and that no row changes."""
+    of_surface, of_field = ({own: row for row, own in t.items()} for t in (_SURFACE, _FIELD))
+    of_wave = {place: row for row, place in _WAVE.items()}
+    starts = [n for n, line in enumerate(texts[0]) if line.startswith("SURF")]
+    found = [f"MNUM {len(texts)} 1"]
+    for n, words, at, values in differing(texts):
+        surface, key = bisect.bisect_right(starts, n) - 1, words[0]
+        if surface >= 0 and at == 1 and key in of_surface:
+            operand = f"{of_surface[key]} {surface}"
+        elif key in of_field:
+            operand = f"{of_field[key]} {at}"
+        elif key == "WAVM" and at > 1:
+            operand = f"{of_wave[at - 1]} {words[1]}"
+        else:
+            some = f"{' '.join(words)[:40]}, {' and '.join(values)}"
+            raise LensError(f"configurations differ in {some}, which no row of .zmx changes here")
+        for k, value in enumerate(values, 1):
+            number = "1.0E+10" if value == "INFINITY" else value
+            found.append(f"{operand} {k} {number} 0 0 0 1 1 1 0 0")
+    return found

@@ -221,7 +221,7 @@ def test_what_is_read_back_otherwise_is_not_written(tmp_path, monkeypatch):
             if name == "sensor 52.45" and kind != ".yaml":
                 continue  # there it is a thickness
             text = {".zmx": write.zmx_text, ".seq": write.seq_text}.get(kind, write._yaml_text)
-            wrong = text(system_for(other))
+            wrong = text([system_for(other)])
             place = "zmx_text" if kind == ".zmx" else "seq_text" if kind == ".seq" else "_yaml_text"
             with monkeypatch.context() as patch:
                 patch.setattr(write, place, lambda system, wrong=wrong: wrong)
@@ -321,7 +321,7 @@ def lost_parts_are_named(system, path, monkeypatch):
     }
     name, before = f"{path.suffix[1:]}_text", path.read_text()
     for what, other in others.items():
-        wrong = getattr(write, name)(dataclasses.replace(system, **other))
+        wrong = getattr(write, name)([dataclasses.replace(system, **other)])
         with monkeypatch.context() as patch:
             patch.setattr(write, name, lambda _, wrong=wrong: wrong)
             with pytest.raises(LensError) as error:
