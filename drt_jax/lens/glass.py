@@ -41,6 +41,13 @@ class Glass:
     model: nd and vd of a model glass, see `model_glass`.
     partial: P_gF of a model glass less that of the normal line.
     maker, source: as in the table of glasses; "" for none.
+    thermal: D0 (1/K), D1 (1/K^2), D2 (1/K^3), E0 (um^2/K), E1 (um^2/K^2) and L_TK (um) of Schott's
+        formula for the absolute index at another temperature, see `design.at_temperature`; empty
+        if they are not known.
+    expansion: linear, from -30 to 70 C, 1e-6/K; None if it is not known.
+    celsius: temperature of glass and air at which the constants hold, C.
+    status: "standard", "preferred", "obsolete", "special" or "melt", as the maker calls it; "" if
+        it is not known.
     """
 
     name: str
@@ -51,6 +58,10 @@ class Glass:
     partial: float = 0.0
     maker: str = ""
     source: str = ""
+    thermal: tuple[float, ...] = ()
+    expansion: float | None = None
+    celsius: float = 20.0
+    status: str = ""
 
 
 @jax.tree_util.register_dataclass
