@@ -45,6 +45,8 @@ def save_lens(lens: Lens | System, path: str | pathlib.Path) -> None:
     """
     kind = known_ending(path)
     system = lens if isinstance(lens, System) else system_for(lens)
+    at_20 = system.lens.dispersion.thermal is None
+    require(at_20, f"{path}: a file has no indices of another temperature; save the lens at 20 C")
     if kind in (".yaml", ".yml") and isinstance(lens, System):
         warn(f"{path}: fields, wavelengths and vignetting are not written")
     try:
