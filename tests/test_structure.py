@@ -48,7 +48,7 @@ ALLOWED_ALL = {"learn.__init__", *(f"show.{name}" for name in (*_DRAWN, "toleran
 ROOMS = {
     "drt_jax": 562,
     "drt_jax/check": 298,
-    "drt_jax/design": 3218,
+    "drt_jax/design": 3230,
     "drt_jax/files": 3029,
     "drt_jax/image": 3043,
     "drt_jax/learn": 656,

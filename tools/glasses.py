@@ -142,6 +142,8 @@ def specs(database: pathlib.Path):
                 if data["type"] not in ("formula 1", "formula 2", "formula 3"):
                     continue
                 glass = of_database(path.stem, data, entry.get("PROPERTIES") or {})
+                if "Zemax" not in str(entry["REFERENCES"]):  # a data sheet has no status
+                    glass = dataclasses.replace(glass, status="")
                 place = path.relative_to(database / "data").as_posix()
                 wanted = entry.get("PROPERTIES", {}).get("nd")
                 if wanted and abs(squares(glass, LINES[:1])[0] ** 0.5 - float(wanted)) > 1e-4:

@@ -20,6 +20,7 @@ from .focusing import Focusing as Focusing, focusing as focusing
 from .glasses import (
     Snap as Snap,
     Snapped as Snapped,
+    ordinary_glass as ordinary_glass,
     snap_glasses as snap_glasses,
 )
 from .grades import GRADES as GRADES, Grade as Grade, graded as graded
