@@ -20,6 +20,9 @@ from . import _command, _common, _plots
 from ._common import Numbers, Wavelengths, not_empty, within
 from .runs.folder import Run
 
+# Moves of the sensor that find the focus, relative to its place.
+_STEP = 1e-3
+
 
 @dataclasses.dataclass(frozen=True)
 class Mount:
@@ -52,10 +55,14 @@ class Config:
 
 
 def focused(config: Config, lens: drt_jax.Lens, scene: Scene) -> drt_jax.Lens:
-    """The lens with the sensor where the mean square of all spots is smallest."""
+    """The lens with the sensor where the mean square of all spots, a parabola over its place, is
+    smallest."""
     variables = design.Variables.from_lens(lens, ["sensor"])
     problem = design.Problem.from_variables(variables, ["spot"], scene, config.order)
-    return dataclasses.replace(lens, sensor=design.optimise(problem).lens.sensor)
+    step = _STEP * lens.sensor / variables.scale
+    low, middle, high = (problem.merit(variables.start + sign * step) for sign in (-1, 0, 1))
+    move = 0.5 * step * (low - high) / (low - 2 * middle + high)
+    return variables.lens_of(variables.start + move)
 
 
 def row_of(config: Config, lens: drt_jax.Lens, mount: Mount, celsius: float) -> dict[str, Any]:
