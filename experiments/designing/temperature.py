@@ -111,21 +111,27 @@ def tables(results: dict[str, Any]) -> dict[str, str]:
 
 
 def draw(results: dict[str, Any], figures: pathlib.Path) -> None:
-    """Draws the spots of each mount over temperature, with the smallest after refocusing."""
+    """Draws focus and spots of each mount over temperature; and of the first, refocused."""
+
+    def mean(row: dict[str, Any], key: str) -> float:
+        return math.hypot(*row[key]) / math.sqrt(len(row[key]))
+
     groups = _common.grouped(results["rows"], "mount")
-    series = {}
+    values = {"shift": {}, "spots": {}}
     for (mount,), rows in groups.items():
         celsius = np.array([row["celsius"] for row in rows])
-        for name, key in ((mount, "spots_um"), (f"{mount}, refocused", "refocused_um")):
-            spots = np.array([math.hypot(*row[key]) / math.sqrt(len(row[key])) for row in rows])
-            series[name] = celsius, spots
-    styles = [
-        {"color": f"C{k // 2}", "linestyle": "--" if k % 2 else "-", "marker": "" if k % 2 else "o"}
-        for k in range(len(series))
-    ]
-    with _plots.picture(figures / "temperature.png", 6.0, 3.6) as (axes,):
-        _plots.curves(axes, series, "temperature (C)", "RMS spot (um)", styles=styles)
-        axes.set_ylim(bottom=0)
+        values["shift"][mount] = celsius, np.array([row["shift_um"] for row in rows])
+        values["spots"][mount] = celsius, np.array([mean(row, "spots_um") for row in rows])
+    first, *_ = groups
+    again = np.array([mean(row, "refocused_um") for row in groups[first]])
+    styles = [{"marker": "o", "markersize": 4} for _ in groups]
+    with _plots.picture(figures / "temperature.png", 4.5, 3.4, 2) as (left, right):
+        _plots.curves(left, values["shift"], "temperature (C)", "focus (um)", styles=styles)
+        values["spots"][f"{first[0]}, refocused"] = values["spots"][first[0]][0], again
+        styles.append({"color": "C0", "linestyle": "--"})
+        _plots.curves(right, values["spots"], "temperature (C)", "RMS spot (um)", styles=styles)
+        right.set_ylim(0, 1.1 * right.get_ylim()[1])
+        right.legend(loc="lower center", fontsize=8)
 
 
 if __name__ == "__main__":
