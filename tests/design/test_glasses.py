@@ -1,5 +1,6 @@
 """Model glasses that become real ones, against thin lenses in closed form."""
 
+import dataclasses
 import functools
 
 import jax
@@ -166,6 +167,11 @@ def test_what_cannot_snap_is_refused():
         with pytest.raises(ValueError, match=said):
             design.snap_glasses(problem, found, **given)
     lens = problem.variables.lens
+    like = {name: find_glass("N-BK7") for name in lens.glasses[1:3]}
+    model = design.ThermalModel.from_lens(lens, glasses=like)
+    warm = problem.variables.at_temperature(40.0, model)
+    with pytest.raises(ValueError, match="snap_glasses takes one at 20 C"):
+        design.snap_glasses(dataclasses.replace(problem, variables=warm), found)
     for vary, ties, said in (
         (["index"], [Tie((0, 1), kind="index", scale=1.01)], "index 1 is tied with a scale"),
         (["curvature"], [], "has no model glass"),
