@@ -12,10 +12,12 @@ Sources, in this order; a name that a maker has already is not taken a second ti
   AGF holds as OWNER/NAME (a database of facts; nothing else is taken from there).
 
 A line of the table is `#MAKER, temperature in C, source` for the glasses that follow, or a glass:
-name, range in um, Sellmeier's constants, Schott's constants, as in `drt_jax.lens.glass.Glass`,
-apart by tabs. A `*` before a name: it means this glass where no maker is given.
+name, range in um, Sellmeier's constants, Schott's constants, thermal constants, expansion and
+status, as in `drt_jax.lens.glass.Glass`, apart by tabs. A `*` before a name: it means this glass
+where no maker is given.
 """
 
+import dataclasses
 import gzip
 import hashlib
 import html
@@ -49,6 +51,15 @@ COLLECTIONS = (
     ("INFRARED", "nzhagen/zemaxglass", "bb2486d", "AGF_files/infrared.agf", "Zemax's INFRARED"),
     ("CORNING", "nzhagen/zemaxglass", "bb2486d", "AGF_files/corning.agf", "Corning's catalogue"),
 )
+# Of these makers the database holds later lists: what these do not hold is no longer made.
+OBSOLETE = ("SCHOTT", "HOYA")
+# The status of a glass by its name in the database, which calls the numbers 0 to 3 of `.agf` files
+# None, standard, preferred and special. In Schott's file of 2017 they stand for standard,
+# preferred, obsolete and special, as Zemax's manual has them, and the same glasses have them: the
+# 10 that the database calls preferred (N-LASF31, KZFSN4, SF15, ...) are those that Schott gave up.
+STATUS = {None: "standard", "standard": "preferred", "preferred": "obsolete", "special": "special"}
+# Range of temperatures of the expansion that is taken, K.
+RANGE = "243 343"
 # Of Corning's catalogue, fused silica 7980 alone is still made.
 ONLY = {"CORNING": ["C79-80"]}
 ORDER = {0: 0, 2: 1, -2: 2, -4: 3, -6: 4, -8: 5, 4: 6, -10: 7, -12: 8}
@@ -84,8 +95,10 @@ def line_of(glass: Glass) -> str:
     """A glass in the table."""
     sellmeier = glass.sellmeier if any(glass.sellmeier) else ()
     schott = glass.schott if glass.schott != Glass.schott else ()
-    parts = [" ".join(map(plain_number, part)) for part in (glass.range, sellmeier, schott)]
-    return "\t".join([glass.name, *parts])
+    expansion = () if glass.expansion is None else (glass.expansion,)
+    numbers = (glass.range, sellmeier, schott, glass.thermal, expansion)
+    parts = [" ".join(map(plain_number, part)) for part in numbers]
+    return "\t".join([glass.name, *parts, glass.status])
 
 
 def plain_number(value: float) -> str:
@@ -116,7 +129,8 @@ def substances():
     """Of glasses.yaml."""
     for name, entry in yaml.safe_load((HERE / "glasses.yaml").read_text()).items():
         head = f"\t{entry.pop('celsius', 20)}\t{entry.pop('source')}"
-        yield head, True, Glass(str(name), **{key: tuple(own) for key, own in entry.items()})
+        own = {key: tuple(a) if isinstance(a, list) else a for key, a in entry.items()}
+        yield head, True, Glass(str(name), **own)
 
 
 def specs(database: pathlib.Path):
@@ -127,7 +141,9 @@ def specs(database: pathlib.Path):
             for data in entry.get("DATA", ()):
                 if data["type"] not in ("formula 1", "formula 2", "formula 3"):
                     continue
-                glass = of_database(path.stem, data)
+                glass = of_database(path.stem, data, entry.get("PROPERTIES") or {})
+                if "Zemax" not in str(entry["REFERENCES"]):  # a data sheet has no status
+                    glass = dataclasses.replace(glass, status="")
                 place = path.relative_to(database / "data").as_posix()
                 wanted = entry.get("PROPERTIES", {}).get("nd")
                 if wanted and abs(squares(glass, LINES[:1])[0] ** 0.5 - float(wanted)) > 1e-4:
@@ -141,17 +157,25 @@ def specs(database: pathlib.Path):
                 yield f"{maker.upper()}\t{round(celsius)}\t{source}", place.startswith(PLAIN), glass
 
 
-def of_database(name: str, data: dict) -> Glass:
+def of_database(name: str, data: dict, properties: dict) -> Glass:
     """A glass of the database."""
+    more = {"status": STATUS[properties.get("glass_status")]} if properties else {}
+    for own in properties.get("thermal_dispersion", ()):
+        thermal = tuple(map(float, own["coefficients"].split()))
+        more |= {"thermal": thermal} if any(thermal) else {}
+    for own in properties.get("thermal_expansion", ()):
+        if own["temperature_range"] == RANGE:
+            more["expansion"] = round(1e6 * float(own["value"]), 6)
     first, *rest = map(float, data["coefficients"].split())
     low, high = map(float, data["wavelength_range"].split())
     if data["type"] == "formula 3":
         schott = [first] + [0.0] * 8
         for value, power in zip(rest[::2], rest[1::2], strict=True):
             schott[ORDER[int(power)]] += value
-        return Glass(name, schott=cut(schott), range=(low, high))
+        return Glass(name, schott=cut(schott), range=(low, high), **more)
     resonances = [c**2 if data["type"] == "formula 1" else c for c in rest[1::2]]
-    return Glass(name, (*rest[::2], *resonances), (1 + first, *[0.0] * 5), (low, high))
+    schott = (1 + first, *[0.0] * 5)
+    return Glass(name, (*rest[::2], *resonances), schott, (low, high), **more)
 
 
 def cut(schott: list[float]) -> tuple[float, ...]:
@@ -168,22 +192,10 @@ def obsolete(collections: pathlib.Path):
             found = load_agf(collections / repository / file, ONLY.get(maker), missing="warn")
         for warning in told:
             print(f"left out: {warning.message}")
-        celsius = temperatures(collections / repository / file)
-        for name, glass in found.items():
-            yield f"{maker}\t{celsius.get(name, 20)}\t{source}", False, glass
-
-
-def temperatures(path: pathlib.Path) -> dict[str, int]:
-    """The temperature in C of each glass, at the end of its line TD."""
-    content = path.read_bytes()
-    text = content.decode("utf-16" if content.startswith(b"\xff\xfe") else "latin-1")
-    name, found = "", {}
-    for words in map(str.split, text.splitlines()):
-        if words[:1] == ["NM"]:
-            name = words[1]
-        elif words[:1] == ["TD"] and len(words) > 7:
-            found[name] = round(float(words[7]))
-    return found
+        for glass in found.values():
+            if maker in OBSOLETE:
+                glass = dataclasses.replace(glass, status="obsolete")
+            yield f"{maker}\t{round(glass.celsius)}\t{source}", False, glass
 
 
 if __name__ == "__main__":

@@ -6,6 +6,10 @@ from ..lens.insert import (
     with_asphere as with_asphere,
     with_stop as with_stop,
 )
+from ..lens.temperature import (
+    ThermalModel as ThermalModel,
+    at_temperature as at_temperature,
+)
 from . import least_squares as least_squares
 from .assembly import Assembly as Assembly, as_built as as_built
 from .compensation import AsBuilt as AsBuilt
@@ -16,6 +20,7 @@ from .focusing import Focusing as Focusing, focusing as focusing
 from .glasses import (
     Snap as Snap,
     Snapped as Snapped,
+    ordinary_glass as ordinary_glass,
     snap_glasses as snap_glasses,
 )
 from .grades import GRADES as GRADES, Grade as Grade, graded as graded

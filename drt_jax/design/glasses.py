@@ -1,6 +1,7 @@
 """Replaces model glasses by real glasses, one place after the other, the least costly one first."""
 
 import dataclasses
+import re
 from collections.abc import Callable, Collection, Iterator
 from itertools import islice
 from typing import NamedTuple
@@ -23,6 +24,9 @@ _SAME = (1e-5, 1e-2)
 # Smallest relative gain for which a real glass is exchanged, and the number of exchanges that are
 # tried before the search ends.
 _GAIN, _EXCHANGES = 1e-3, 3
+# Names of glasses with cerium against radiation (G05, G18, ...) and of melts of high transmission,
+# which have the constants of another glass; the wavelength (um) down to which glass shall be clear.
+_SPECIAL, _CLEAR = re.compile(r"(G\d\d|HT(i|ultra)?)(_|$)"), 0.44
 
 
 class Snap(NamedTuple):
@@ -73,6 +77,17 @@ class _Trial(NamedTuple):
     problem: Problem
     vector: np.ndarray
     score: float
+
+
+def ordinary_glass(glass: Glass) -> bool:
+    """Whether a glass is one that its maker lists to be sold today, by its `status`.
+
+    Not so are obsolete and special glasses (on inquiry, for moulding in moulds of one customer),
+    those whose maker gives no status, such as plastics, glasses against radiation (SF6G05), twins
+    of high transmission (N-SF6HT), and glasses whose constants begin above 0.44 um.
+    """
+    sold = glass.status in ("standard", "preferred")
+    return sold and not _SPECIAL.search(glass.name) and glass.range[0] <= _CLEAR
 
 
 def _places(problem: Problem) -> list[tuple[int, ...]]:
@@ -137,7 +152,7 @@ def _neighbours(
         if fits and accept(near.glass):
             known.add(constants)
             yield near
-    remedy = "accept more, or name other makers"
+    remedy = "accept more than design.ordinary_glass, or name other makers"
     require(known, f"snap_glasses: no glass fits behind surface {place[0]}; {remedy}")
 
 
@@ -154,7 +169,7 @@ def snap_glasses(
     problem: Problem,
     found: Optimum,
     makers: Collection[str] | None = ("SCHOTT",),
-    accept: Callable[[Glass], bool] = lambda glass: True,
+    accept: Callable[[Glass], bool] = ordinary_glass,
     count: int = 8,
     steps: int = 12,
     max_steps: int = 100,
@@ -170,7 +185,8 @@ def snap_glasses(
     found: result of `optimise` for `problem`. The operand `glass_map` keeps its model glasses near
         real ones.
     makers: makers of the glasses, see `glass_makers`; None for all.
-    accept: function of a glass, whether it may be used.
+    accept: function of a glass, whether it may be used; by default `ordinary_glass`, which leaves
+        out what is not sold today.
     count: number of glasses tried in each place, the nearest in nd and vd.
     steps: number of steps of least squares with each of them.
     max_steps: as in `optimise`, after each exchange.
@@ -193,6 +209,8 @@ def snap_glasses(
 
     single = isinstance(problem, Problem)
     require(single, "problem: snap_glasses takes one configuration, of `Configurations.problems`")
+    cold = problem.variables.environment is None
+    require(cold, "problem: snap_glasses takes one at 20 C, where its glasses are those of makers")
     places, snaps = _places(problem), list[Snap]()
     left, done = [*places], False
     while not done:

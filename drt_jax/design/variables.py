@@ -13,6 +13,7 @@ from jax import Array
 
 from ..inputs import require, require_one_of, whole_numbers
 from ..lens.lens import Lens
+from ..lens.temperature import ThermalModel, at_temperature
 from ..numerics import Numbers, concrete
 from .media import back_distance
 from .parts import (
@@ -207,6 +208,7 @@ class Variables:
     scale: (N,), in the units of the lens.
     solves: the solves, in the order in which they are applied.
     lines: (T, 2), factor and shift of each tie.
+    environment: temperature, C, and thermal model, see `at_temperature`; None at 20 C.
 
     Static:
     places: N places in the lens.
@@ -221,6 +223,7 @@ class Variables:
     lines: Array
     places: tuple[Place, ...] = dataclasses.field(metadata={"static": True})
     ties: tuple[tuple[int, Place], ...] = dataclasses.field(metadata={"static": True})
+    environment: tuple[Array, ThermalModel] | None = None
 
     @classmethod
     def from_lens(
@@ -303,6 +306,8 @@ class Variables:
             found and all(isinstance(own, Variables) for own in found),
             "variables: expected Variables.from_lens(lens, [...]), or several",
         )
+        cold = all(own.environment is None for own in found)
+        require(cold, "variables: join the sets first, then take them at a temperature")
         kinds, lenses = {place.kind for own in found for place in own.places}, []
         for each in found:
             lens = with_arrays(each.lens, kinds)
@@ -387,7 +392,17 @@ class Variables:
         lens = with_numbers(self.lens, changes)
         for solve in self.solves:
             lens = solve.apply(lens)
-        return lens
+        return lens if self.environment is None else at_temperature(lens, *self.environment)
+
+    def at_temperature(self, celsius: Numbers, model: ThermalModel) -> "Variables":
+        """The same variables, numbers of the lens at 20 C, whose `lens_of` is the lens at another
+        temperature. Ties and solves hold at 20 C.
+
+        celsius: (), C. model: as in `design.at_temperature`; made of the lens, so that glasses that
+            vary keep it.
+        """
+        now = jnp.asarray(celsius, self.low.dtype)
+        return dataclasses.replace(self, environment=(now, model))
 
 
 def _where(place: Place) -> str:

@@ -2,12 +2,15 @@
 
 import os
 from collections.abc import Callable, Collection
+from typing import Any
 
 from ..lens.glass import Glass
 from ..lens.glasses import flaw
 from .record import Missing, Record, Words, lines_of, naming, short, words_of
 
 _Forms = tuple[list[float], list[float]]  # sellmeier and schott of `Glass`
+# Zemax's numbers of the status of a glass, see `Glass.status`.
+_STATUS = {0: "standard", 1: "preferred", 2: "obsolete", 3: "special", 4: "melt"}
 
 
 def _sellmeier(terms: int) -> Callable[[list[float]], _Forms]:
@@ -61,6 +64,9 @@ def load_agf(
 ) -> dict[str, Glass]:
     """Read the glasses of a `.agf` file by name: at the file's temperatures, relative to air.
 
+    With status, thermal constants and expansion; Zemax writes zeros for what is not known, and so
+    glasses without a thermal constant, or without expansion, have none.
+
     LensError, with the line, if this is no such file, or if a glass has another formula than
     Zemax's 1, 2, 4 and 6 to 13, or has no index above 1 somewhere within its range.
 
@@ -78,11 +84,12 @@ def load_agf(
             blocks[-1].setdefault(words.key, words)
     record.require(blocks, 0, "no line begins with NM: is this a catalogue of glasses?")
     found: dict[str, Glass] = {}
+    constants = lambda glass: (glass.sellmeier, glass.schott, glass.range)  # noqa: E731
     for block in blocks:
         head = block["NM"]
         head.require(len(head.values) >= 2, "expected NM, a name and the number of a formula")
         glass = _glass(record, block) if names is None or head.values[0] in names else None
-        if glass and found.setdefault(glass.name, glass) != glass:
+        if glass and constants(found.setdefault(glass.name, glass)) != constants(glass):
             record.lacks(head.line, f"{short(glass.name)}: another glass of this name")
     record.say()
     return found
@@ -107,8 +114,19 @@ def _glass(record: Record, block: dict[str, Words]) -> Glass | None:
     sellmeier, schott = makes(values)
     low, high = ends.numbers(0, 2)
     ends.require(0 < low < high, f"{called}: no range: {low:g} to {high:g} um")
-    glass = Glass(name, tuple(sellmeier), tuple(schott), (low, high))
+    more = _thermal(block) | {"status": _STATUS.get(int(head.number(6, -1.0)), "")}
+    glass = Glass(name, tuple(sellmeier), tuple(schott), (low, high), **more)
     if wrong := flaw(glass):
         record.lacks(terms.line, f"{called}: {wrong}")
         return None
     return glass
+
+
+def _thermal(block: dict[str, Words]) -> dict[str, Any]:
+    """The fields `thermal`, `celsius` and `expansion` of a glass, from its lines TD and ED."""
+    found: dict[str, Any] = {}
+    if "TD" in block:
+        *thermal, celsius = (block["TD"].number(at, 20.0 if at == 6 else 0.0) for at in range(7))
+        found = {"thermal": tuple(thermal) if any(thermal) else (), "celsius": celsius}
+    expansion = block["ED"].number(0, 0.0) if "ED" in block else 0.0
+    return found | {"expansion": expansion if expansion > 0 else None}

@@ -49,10 +49,10 @@ def save_lens(lens: Lens | System | Sequence[Lens | System], path: str | pathlib
     given = [lens] if isinstance(lens, Lens | System) else [*lens]
     require(given, "lens: expected a lens, a system, or several systems, got none")
     systems = [own if isinstance(own, System) else system_for(own) for own in given]
+    at_20 = all(own.lens.dispersion.thermal is None for own in systems)
+    require(at_20, f"{path}: a file has no indices of another temperature; save the lens at 20 C")
     if kind in (".yaml", ".yml"):
-        require(
-            len(systems) == 1, f"{path}: a prescription has one configuration: write .zmx, .seq"
-        )
+        require(len(systems) == 1, f"{path}: a prescription has one configuration: use .zmx, .seq")
         if isinstance(given[0], System):
             warn(f"{path}: fields, wavelengths and vignetting are not written")
     try:

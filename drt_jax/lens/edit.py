@@ -43,8 +43,9 @@ def _terms(form: str, count: int) -> tuple[np.ndarray, np.ndarray]:
     return powers, signs
 
 
-def _resized(coefficients: Array, forms: tuple[str, ...], factor: Array) -> Array:
-    """Coefficients (N, K) of forms or phases, after all lengths were multiplied by `factor`."""
+def resized(coefficients: Array, forms: tuple[str, ...], factor: Array) -> Array:
+    """Coefficients (N, K) of forms or phases, after all lengths were multiplied by `factor`, one or
+    (N, 1)."""
     powers = np.array([_terms(form, coefficients.shape[1])[0] for form in forms])
     return coefficients * factor ** jnp.asarray(powers, factor.dtype)
 
@@ -69,13 +70,13 @@ def scaled(lens: Lens, factor: Numbers) -> Lens:
 
     phase, elements, apertures = lens.phase, lens.elements, lens.apertures
     if phase is not None:
-        own = _resized(phase.coefficients, phase.forms, size)
+        own = resized(phase.coefficients, phase.forms, size)
         phase = dataclasses.replace(phase, coefficients=own)
     return larger(
         lens,
         *("thickness", "semi_diameter", "sensor", "decentre"),
         curvature=lens.curvature / size,
-        coefficients=_resized(lens.coefficients, lens.forms, size),
+        coefficients=resized(lens.coefficients, lens.forms, size),
         phase=phase,
         elements=elements and larger(elements, "shift", "pivot"),
         apertures=apertures and larger(apertures, "half", "centre"),

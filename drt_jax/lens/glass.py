@@ -41,6 +41,13 @@ class Glass:
     model: nd and vd of a model glass, see `model_glass`.
     partial: P_gF of a model glass less that of the normal line.
     maker, source: as in the table of glasses; "" for none.
+    thermal: D0 (1/K), D1 (1/K^2), D2 (1/K^3), E0 (um^2/K), E1 (um^2/K^2) and L_TK (um) of Schott's
+        formula for the absolute index at another temperature, see `design.at_temperature`; empty
+        if they are not known.
+    expansion: linear, from -30 to 70 C, 1e-6/K; None if it is not known.
+    celsius: temperature of glass and air at which the constants hold, C.
+    status: "standard", "preferred", "obsolete", "special" or "melt", as the maker calls it; "" if
+        it is not known.
     """
 
     name: str
@@ -51,6 +58,10 @@ class Glass:
     partial: float = 0.0
     maker: str = ""
     source: str = ""
+    thermal: tuple[float, ...] = ()
+    expansion: float | None = None
+    celsius: float = 20.0
+    status: str = ""
 
 
 @jax.tree_util.register_dataclass
@@ -67,6 +78,10 @@ class Dispersion:
     ranges: (M, 2), shortest and longest wavelength at which each index is known, um.
     model: (M, 2), nd and vd of model glasses, nd = 1 for other media; None without any.
     partial: (M,), P_gF of model glasses less that of the normal line; None if all are 0.
+    thermal: (M, 5), change from the temperature of the constants, see `design.at_temperature`: of
+        Schott's formula D0 d + D1 d^2 + D2 d^3, E0 d + E1 d^2 (um^2) and L_TK^2 (um^2), and the
+        density of the air before and now, relative to 15 C and one atmosphere; 0 for air. None at
+        the temperature of the constants.
     """
 
     strength: Array
@@ -75,6 +90,7 @@ class Dispersion:
     ranges: Array
     model: Array | None = None
     partial: Array | None = None
+    thermal: Array | None = None
 
     @property
     def range(self) -> tuple[Any, Any]:
@@ -150,7 +166,11 @@ def with_media(dispersion: Dispersion, rows: np.ndarray, other: Dispersion) -> D
 
     other: M media, or one medium for all. The result has as many terms as the dispersion with more
         of them.
+
+    ValueError for a glass of the catalogue among media that `design.at_temperature` has changed.
     """
+    hot = dispersion.thermal is not None and other.thermal is None
+    require(not hot, "lens: is at another temperature; change glasses of the lens at 20 C")
 
     def mixed(name: str, none: Any) -> Any:
         both = getattr(dispersion, name), getattr(other, name)
@@ -163,7 +183,7 @@ def with_media(dispersion: Dispersion, rows: np.ndarray, other: Dispersion) -> D
             old, new = (jnp.pad(a, ((0, 0), (0, width - a.shape[1]))) for a in (old, new))
         return jnp.where(mask, new, old).astype(dispersion.schott.dtype)
 
-    nones = {"model": [_NO_MODEL], "partial": [0.0]}
+    nones = {"model": [_NO_MODEL], "partial": [0.0], "thermal": [[0.0] * 5]}
     names = (field.name for field in dataclasses.fields(Dispersion))
     return Dispersion(**{name: mixed(name, nones.get(name)) for name in names})
 
@@ -175,6 +195,8 @@ def with_models(dispersion: Dispersion, rows: np.ndarray) -> Dispersion:
     found = nd_and_vd(dispersion)
     none = jnp.zeros((1, 1), found.dtype)
     models = Dispersion(none, none, none + 1, jnp.asarray([VISIBLE], found.dtype), found)
+    if dispersion.thermal is not None:  # nd and vd are those at the temperature
+        models = dataclasses.replace(models, thermal=jnp.zeros((1, 5), found.dtype))
     return with_media(dispersion, rows, models)
 
 
@@ -195,6 +217,22 @@ def _model_index(model: Array, partial: Array | None, wavelengths: Array) -> Arr
     return matmul(matmul(own, jnp.asarray(formula, known.dtype)), powers)
 
 
+def _air(wavelengths: Array) -> Array:
+    """Index of air at 15 C and one atmosphere, less 1, in the shape of the wavelengths, um: Edlen's
+    formula of 1953 as in Kohlrausch's Praktische Physik, which Schott and OpticStudio use; below
+    its range the value at 0.2 um."""
+    square = jnp.clip(wavelengths, 0.2) ** -2
+    return 1e-8 * (6432.8 + 2949810 / (146 - square) + 25540 / (41 - square))
+
+
+def air_density(celsius: Array, pressure: Array) -> Array:
+    """Density of air relative to that at 15 C and one atmosphere, as OpticStudio has it.
+
+    celsius, pressure: C and atmospheres, of shapes that broadcast.
+    """
+    return pressure / (1 + 3.4785e-3 * (celsius - 15))
+
+
 @program
 def refractive_index(dispersion: Dispersion, wavelengths: Array) -> Array:
     """Index of each medium at each wavelength, (M, W), relative to air, whose index is 1.
@@ -213,6 +251,13 @@ def refractive_index(dispersion: Dispersion, wavelengths: Array) -> Array:
     count = dispersion.schott.shape[1]
     powers = jnp.stack([(wavelengths if p > -9 else within) ** p for p in POWERS[:count]])
     index = safe_sqrt(sellmeier + matmul(dispersion.schott, powers))
-    if dispersion.model is None:
+    if dispersion.model is not None:
+        index = index + _model_index(dispersion.model, dispersion.partial, wavelengths)
+    if dispersion.thermal is None:
         return index
-    return index + _model_index(dispersion.model, dispersion.partial, wavelengths)
+    # From relative to absolute, by Schott's formula, and back to relative: to other air.
+    change, pole, resonance, before, now = dispersion.thermal.T[..., None]
+    air = _air(wavelengths)[None]
+    share = change + safe_divide(pole, square[0] - resonance)
+    absolute = index * (1 + before * air) + safe_divide(index**2 - 1, 2 * index) * share
+    return absolute / (1 + now * air)

@@ -52,18 +52,30 @@ def _table() -> dict[str, list[_Entry]]:
     Each glass has the shortest name by which `find_glass` finds it: the name alone, or NAME_MAKER.
     """
     table = {"air": [_Entry(True, Glass("air"))]}
-    maker = source = ""
+    maker = source = celsius = ""
     for line in gzip.decompress(_TABLE.read_bytes()).decode().split("\n"):
         if line.startswith("#"):
             maker, celsius, source = line[1:].split("\t")[:3]
             source = f"{source}; at {celsius} C" if celsius else source
             continue
-        marked, *constants = line.split("\t")
-        ends, sellmeier, schott = (tuple(map(float, part.split())) for part in constants)
+        marked, *constants, status = line.split("\t")
+        numbers = [tuple(map(float, part.split())) for part in constants]
+        ends, sellmeier, schott, thermal, expansion = numbers
         name, plain = marked.removeprefix("*"), marked.startswith("*")
-        made = sellmeier or Glass.sellmeier, schott or Glass.schott, (ends[0], ends[1])
         entries = table.setdefault(name, [])
-        entry = _Entry(plain, Glass(name, *made, maker=maker, source=source))
+        glass = Glass(
+            name,
+            sellmeier or Glass.sellmeier,
+            schott or Glass.schott,
+            (ends[0], ends[1]),
+            maker=maker,
+            source=source,
+            thermal=thermal,
+            expansion=expansion[0] if expansion else None,
+            celsius=float(celsius or 20),
+            status=status,
+        )
+        entry = _Entry(plain, glass)
         entries.insert(0 if plain else len(entries), entry)
     for name, entries in table.items():
         differ = len({(g.sellmeier, g.schott, g.range) for _, g in entries}) > 1

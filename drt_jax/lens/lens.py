@@ -75,7 +75,7 @@ class Labels:
 # What has no derivative by a whole lens, see `Lens`: an array at the stop, or arrays of a part.
 HELD = {
     "semi_diameter": (),
-    "dispersion": ("strength", "resonance", "schott", "ranges"),
+    "dispersion": ("strength", "resonance", "schott", "ranges", "thermal"),
     "phase": ("order",),
 }
 _REMEDY = "; go back to the lens before, and if an optimiser decays weights, give it `movable`"

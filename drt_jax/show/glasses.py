@@ -74,6 +74,9 @@ def glass_lines(glass: Glass) -> Iterator[str]:
         above = partial - NORMAL_LINE[0] - NORMAL_LINE[1] * point[1]
         yield f"  P_gF                 {partial:.4f}, {above:+.4f} from the normal line"
     yield f"  range                {low:g} to {high:g} um"
+    expansion = "not known" if glass.expansion is None else f"{glass.expansion:g}e-6/K, -30 to 70 C"
+    yield f"  expansion            {expansion}; dn/dT {'known' if glass.thermal else 'not known'}"
+    yield f"  status               {glass.status or 'not known'}"
     yield f"  source               {glass.source or 'none'}"
     near = [name for name in near_names(glass.name, _NEAR + 1) if name != glass.name]
     yield f"  near in spelling     {', '.join(near[:_NEAR])}"

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from drt_jax import Scene, design, load_lens
+from drt_jax import Scene, design, first_order, load_lens
 from drt_jax.design import Configurations, Operand, Problem, Solve, Tie, Variables, Vary, configured
 from drt_jax.design.optimum import take_step
 from drt_jax.rays.solve import solve_aimed
@@ -270,3 +270,42 @@ def test_configured_folds_a_mirror_and_keeps_the_rest():
     np.testing.assert_array_equal(two.tilt[2], [0.1, 0, 0])
     np.testing.assert_allclose(two.sensor - one.sensor, 1.0)  # it keeps its distance
     np.testing.assert_array_equal(one.curvature, lens.curvature)
+
+
+@pytest.mark.slow
+def test_an_athermal_pair_is_that_of_the_closed_form():
+    """Thin lenses of N-FK51A and N-BK7 in contact, 100 mm in front of the sensor in a tube of
+    aluminium, in focus at -20 and at 60 C: the powers at 20 C solve two linear equations."""
+    surface = {"thickness": 1e-6, "semi_diameter": 0.005}
+    rows = [
+        surface | {"radius": 60.0, "glass": "N-FK51A", "stop": True},
+        surface | {"radius": "inf"},
+        surface | {"radius": 400.0, "glass": "N-BK7"},
+        {"radius": "inf", "semi_diameter": 0.005},
+    ]
+    lens = load_lens({"surfaces": rows, "sensor": 100.0})
+    model = design.ThermalModel.from_lens(lens, 23.6)
+    cold = Variables.from_lens(lens, [Vary("curvature", (0, 2))])
+    sets = [cold.at_temperature(celsius, model) for celsius in (-20.0, 60.0)]
+    one = Scene.point(wavelengths=0.55)
+    problems = [Problem.from_variables(own, [Operand("spot", weight=1e6)], one, 2) for own in sets]
+    joined = Configurations.from_problems(problems)
+    assert len(joined.groups) == 1 and joined.variables.names == cold.names
+    found = design.optimise(joined, max_steps=40)
+    lenses = [design.at_temperature(lens, celsius, model) for celsius in (-20.0, 60.0)]
+    index = np.array([np.asarray(own.index(0.55))[[1, 3], 0] for own in (lens, *lenses)])
+    grow = 1 + 1e-6 * np.array([[-40.0], [40.0]]) * np.array([12.74, 7.1])
+    powers = (index[1:] - 1) / (index[0] - 1) / grow
+    wanted = np.linalg.solve(powers, 1 / (100 * (1 + 23.6e-6 * np.array([-40.0, 40.0]))))
+    curvature = np.asarray(cold.lens_of(found.vector).curvature)[[0, 2]]
+    np.testing.assert_allclose(curvature * (index[0] - 1), wanted, rtol=1e-4)
+    # the lens of each configuration is that at its temperature; it is in focus, the lens of
+    # one glass is not
+    hot = joined.lenses(found.vector)[1]
+    assert hot.glasses[1] == "N-FK51A at 60 C"
+    focus = [float(first_order(own, np.inf, 0.55).back_focal_distance[0]) for own in lenses]
+    assert abs(focus[1] - float(lenses[1].sensor)) > 0.01
+    focal = float(first_order(hot, np.inf, 0.55).back_focal_distance[0])
+    np.testing.assert_allclose(focal, hot.sensor, atol=2e-4)
+    with pytest.raises(ValueError, match="join the sets first"):
+        Variables.joined(sets)

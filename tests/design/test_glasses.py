@@ -1,5 +1,6 @@
 """Model glasses that become real ones, against thin lenses in closed form."""
 
+import dataclasses
 import functools
 
 import jax
@@ -166,6 +167,11 @@ def test_what_cannot_snap_is_refused():
         with pytest.raises(ValueError, match=said):
             design.snap_glasses(problem, found, **given)
     lens = problem.variables.lens
+    like = {name: find_glass("N-BK7") for name in lens.glasses[1:3]}
+    model = design.ThermalModel.from_lens(lens, glasses=like)
+    warm = problem.variables.at_temperature(40.0, model)
+    with pytest.raises(ValueError, match="snap_glasses takes one at 20 C"):
+        design.snap_glasses(dataclasses.replace(problem, variables=warm), found)
     for vary, ties, said in (
         (["index"], [Tie((0, 1), kind="index", scale=1.01)], "index 1 is tied with a scale"),
         (["curvature"], [], "has no model glass"),
@@ -201,3 +207,13 @@ def test_tied_glasses_are_one():
     best = design.snap_glasses(problem, found, count=2, steps=2, max_steps=3)
     assert best.lens.glasses[1] == best.lens.glasses[3] != best.lens.glasses[2]
     assert {snap.surfaces for snap in best.snaps} == {(0, 2), (1,)}
+
+
+def test_glasses_that_are_sold_today():
+    """SF6G05 is against radiation, N-LASF31 was replaced by N-LASF31A, N-SF6HT has the constants of
+    N-SF6, LAK9G15 and N-LAF3 are made on inquiry; PMMA is no glass, IRG24 is black."""
+    ordinary = ("N-BK7", "N-SF6", "SF6", "F2", "N-LASF31A", "N-PK51", "S-FPL51", "H-K9L", "FCD1")
+    others = ("SF6G05", "N-LASF31", "N-SF6HT", "N-SF57HTultra", "FK5HTi", "LAK9G15", "N-LAF3")
+    others += ("BK7_SCHOTT", "PMMA", "IRG24", "SF15", "BSM16")
+    assert [name for name in ordinary if not design.ordinary_glass(find_glass(name))] == []
+    assert [name for name in others if design.ordinary_glass(find_glass(name))] == []

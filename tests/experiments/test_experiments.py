@@ -87,6 +87,7 @@ def test_every_config_loads_strictly(path):
     kind = CONFIGS[path].Config
     others = {"seed": "99", "repeats": "99", "seeds": "99", "folders": "[elsewhere]"}
     others |= {"starts": "{seed: 99}", "parts": "[0.5]", "trials": "99", "bend": "0.5"}
+    others |= {"celsius": "[99]"}
     name = next(name for name in others if name in kind.__dataclass_fields__)
     other = "starts.seed=99" if name == "starts" else f"{name}={others[name]}"
     assert load_config(kind, path) != load_config(kind, path, [other])

@@ -12,7 +12,7 @@ import pytest
 from PIL import Image
 
 import experiments
-from drt_jax import first_order, load_lens, save_lens
+from drt_jax import design, first_order, load_lens, save_lens
 from experiments import _command, _psf_peers, _work, benchmark, tables
 from experiments.runs.folder import Run
 
@@ -53,6 +53,10 @@ STARTS = {
         *("design.operands=[{kind: spot}, {kind: focal_length, low: 50, high: 50.01}]",),
         *("design.glasses={makers: []}", "design.trials=10"),
     ],
+    "temperature": [
+        *("lens=singlet", "fields_deg=[0]", "wavelengths_um=[0.55]", "celsius=[-20, 60]"),
+        *("mounts=[{name: brass, expansion: 19}]", "order=3", "tolerance=0.1"),
+    ],
     "joint": [
         *(
             "lens=singlet",
@@ -70,6 +74,7 @@ STARTS = {
 }
 # Programs of many kinds.
 LONG = ("benchmark", "elements", "faults", "files", "images", "joint", "skips", "stability")
+LONG += ("temperature",)
 # Those that tests of their own start, in `test_NAME`.
 ELSEWHERE = ("accuracy", "design", "render", "tolerance", "zoom")
 
@@ -172,6 +177,20 @@ def checked_elements(results):
     assert first["elements"] == 1 and {row["elements"] for row in (*others, last)} == {2}
     assert 1 <= len(others) <= 4 and others[0]["merit"] < first["merit"]
     assert last["merit"] <= 1.001 * others[0]["merit"]
+
+
+def checked_temperature(results):
+    """Focus moves as first-order optics has it, to a tenth: spherical aberration changes little."""
+    cold, hot = results["rows"]
+    lens = load_lens("singlet")
+    model = design.ThermalModel.from_lens(lens, 19.0)
+    behind = [
+        first_order(own, np.inf, [0.55]).image_distance[0] - own.sensor
+        for own in (design.at_temperature(lens, celsius, model) for celsius in (-20.0, 60.0))
+    ]
+    expected = 1e3 * float(behind[1] - behind[0])
+    assert hot["shift_um"] - cold["shift_um"] == pytest.approx(expected, rel=0.1)
+    assert all(row["refocused_um"][0] <= row["spots_um"][0] for row in (cold, hot))
 
 
 def checked_joint(results):

@@ -128,3 +128,20 @@ def test_glasses_of_a_maker_in_files(tmp_path):
         text = (tmp_path / "lens.zmx").read_text()
         assert ("_SCHOTT" in text) == (some == names[:2])
     assert isinstance(find_glass("F2", "HIKARI"), Glass)
+
+
+def test_temperature_and_status(tmp_path):
+    """Lines of Schott's and Zeon's catalogues; zeros and missing words are what is not known."""
+    path = tmp_path / "my.agf"
+    path.write_text(
+        "NM F2 2 620364.361 1.62004 36.37 0 1 2\nED 8.200000 9.200000 3.610000 0.0002 0\n"
+        "CD 1 .01 .2 .02 .9 100\nTD 1.51E-06 1.56E-08 -2.78E-11 9.34E-07 1.04E-09 0.25 25\n"
+        "LD 0.4 0.7\nNM 330R 1 509560 1.509420 56.0\nED 0 -1 0.95 0\n"
+        "CD 2.2 -.01 .01 .002 -1e-4 1e-5\nTD 0 0 0 0 0 0 25.0\nLD 0.4 0.7\n"
+        "NM OLD 1 509560 1.509420 56.0 0 2.000 -1\nCD 2.2 -.01 .01 .002 -1e-4 1e-5\nLD 0.4 0.7\n"
+    )
+    one, two, three = load_agf(path).values()
+    assert one.thermal == (1.51e-6, 1.56e-8, -2.78e-11, 9.34e-7, 1.04e-9, 0.25)
+    assert (one.expansion, one.celsius, one.status) == (8.2, 25.0, "preferred")
+    assert (two.thermal, two.expansion, two.celsius, two.status) == ((), None, 25.0, "")
+    assert (three.thermal, three.celsius, three.status) == ((), 20.0, "obsolete")

@@ -113,3 +113,22 @@ def test_nearest_glasses():
     with pytest.raises(ValueError, match="unknown maker 'FOO'"):
         nearest_glasses(1.5, 60, ["FOO"])
     assert "HOYA" in glass_makers()
+
+
+def test_temperature_expansion_and_status():
+    """Of data sheets: SCHOTT's of N-BK7, Ohara's of S-FPL51 (expansion 131e-7/K, at 25 C); and what
+    SCHOTT no longer lists, as N-LASF31, which N-LASF31A replaced, or sells on inquiry."""
+    glass = find_glass("N-BK7")
+    assert glass.thermal == (1.86e-6, 1.31e-8, -1.37e-11, 4.34e-7, 6.27e-10, 0.17)
+    assert (glass.expansion, glass.celsius, glass.status) == (7.1, 20.0, "preferred")
+    ohara = find_glass("S-FPL51")
+    assert (ohara.expansion, ohara.celsius, ohara.status) == (13.1, 25.0, "standard")
+    status = {"N-LASF31": "obsolete", "N-LASF31A": "preferred", "SF6G05": "special"}
+    status |= {
+        "SF15": "obsolete",
+        "BK7_SCHOTT": "obsolete",
+        "SF66": "obsolete",
+        "N-PK51": "preferred",
+    }
+    assert {name: find_glass(name).status for name in status} == status
+    assert find_glass("E48R").thermal == () and find_glass("PMMA").expansion == 60

@@ -1,0 +1,138 @@
+"""What temperature does to a lens in mounts of several metals.
+
+The lens is focused at 20 C. Writes results.json: `rows` with `mount`, `celsius`, `focal_mm`,
+`shift_um` (by how much the sensor would have to move for the smallest spots), and `spots_um` of
+all fields as they are, and `refocused_um` after this move.
+"""
+
+import dataclasses
+import math
+import pathlib
+import sys
+from typing import Annotated, Any
+
+import numpy as np
+
+import drt_jax
+from drt_jax import Scene, design
+
+from . import _command, _common, _plots
+from ._common import Numbers, Wavelengths, not_empty, within
+from .runs.folder import Run
+
+# Moves of the sensor that find the focus, relative to its place.
+_STEP = 1e-3
+
+
+@dataclasses.dataclass(frozen=True)
+class Mount:
+    """A metal between the elements. expansion: 1e-6/K."""
+
+    name: str
+    expansion: Annotated[float, within(-100, 1000)]
+
+
+@dataclasses.dataclass(frozen=True)
+class Config:
+    """Settings of the experiment.
+
+    lens: a bundled lens or a file; all its glasses are of the table.
+    fields_deg: in degrees. distance_mm: of the object; .inf for infinity.
+    mounts: of all air spaces.
+    celsius: temperatures.
+    order: order of the pupil rule that focuses.
+    tolerance: relative error of the spots.
+    """
+
+    lens: str = "double_gauss"
+    fields_deg: Numbers = (0.0, 10.0, 14.0)
+    distance_mm: Annotated[float, within(1e-3, math.inf)] = math.inf
+    wavelengths_um: Wavelengths = (0.4861, 0.5876, 0.6563)
+    mounts: Annotated[tuple[Mount, ...], not_empty] = (Mount("aluminium", 23.6),)
+    celsius: Annotated[Numbers, within(-100, 200)] = (-20.0, 20.0, 60.0)
+    order: Annotated[int, within(1, 40)] = 6
+    tolerance: Annotated[float, within(1e-12, 0.5)] = 1e-3
+
+
+def focused(config: Config, lens: drt_jax.Lens, scene: Scene) -> drt_jax.Lens:
+    """The lens with the sensor where the mean square of all spots, a parabola over its place, is
+    smallest."""
+    variables = design.Variables.from_lens(lens, ["sensor"])
+    problem = design.Problem.from_variables(variables, ["spot"], scene, config.order)
+    step = _STEP * lens.sensor / variables.scale
+    low, middle, high = (problem.merit(variables.start + sign * step) for sign in (-1, 0, 1))
+    move = 0.5 * step * (low - high) / (low - 2 * middle + high)
+    return variables.lens_of(variables.start + move)
+
+
+def row_of(config: Config, lens: drt_jax.Lens, mount: Mount, celsius: float) -> dict[str, Any]:
+    """The lens in a mount at a temperature."""
+    scene = Scene.degrees(config.fields_deg, config.distance_mm, config.wavelengths_um)
+    model = design.ThermalModel.from_lens(lens, mount.expansion)
+    hot = design.at_temperature(lens, celsius, model)
+    moved = focused(config, hot, scene)
+    points = [scene.at(field) for field in np.asarray(scene.field)]
+    middle = config.wavelengths_um[len(config.wavelengths_um) // 2]
+    spots = {
+        name: [_common.spot_um(own, point, config.tolerance)[0] for point in points]
+        for name, own in (("spots_um", hot), ("refocused_um", moved))
+    }
+    shift = 1e3 * float(moved.sensor - hot.sensor)
+    focal = float(drt_jax.focal_length(hot, middle)[0])
+    return {"mount": mount.name, "celsius": celsius, "focal_mm": focal, "shift_um": shift} | spots
+
+
+def run(config: Config, run: Run) -> dict[str, Any]:
+    """Focuses the lens at 20 C, and takes it to all temperatures in all mounts."""
+    scene = Scene.degrees(config.fields_deg, config.distance_mm, config.wavelengths_um)
+    lens = focused(config, drt_jax.load_lens(config.lens), scene)
+    jobs = {
+        f"{mount.name} {celsius:g}": lambda m=mount, t=celsius: row_of(config, lens, m, t)
+        for mount in config.mounts
+        for celsius in config.celsius
+    }
+    return {"rows": _common.measured(run, "lens", jobs), **_common.settings(config, "lens")}
+
+
+def tables(results: dict[str, Any]) -> dict[str, str]:
+    """Focus and spots of each mount and temperature."""
+    header = ["mount", "C", "focal length, mm", "focus, um", "RMS um, not refocused", "refocused"]
+    rows = [
+        [
+            row["mount"],
+            f"{row['celsius']:g}",
+            f"{row['focal_mm']:.3f}",
+            f"{row['shift_um']:.1f}",
+            *(", ".join(f"{um:.1f}" for um in row[name]) for name in ("spots_um", "refocused_um")),
+        ]
+        for row in results["rows"]
+    ]
+    return {"temperature": _common.table(header, rows)}
+
+
+def draw(results: dict[str, Any], figures: pathlib.Path) -> None:
+    """Draws focus and spots of each mount over temperature; and of the first, refocused."""
+
+    def mean(row: dict[str, Any], key: str) -> float:
+        return math.hypot(*row[key]) / math.sqrt(len(row[key]))
+
+    groups = _common.grouped(results["rows"], "mount")
+    values = {"shift": {}, "spots": {}}
+    for (mount,), rows in groups.items():
+        celsius = np.array([row["celsius"] for row in rows])
+        values["shift"][mount] = celsius, np.array([row["shift_um"] for row in rows])
+        values["spots"][mount] = celsius, np.array([mean(row, "spots_um") for row in rows])
+    first, *_ = groups
+    again = np.array([mean(row, "refocused_um") for row in groups[first]])
+    styles = [{"marker": "o", "markersize": 4} for _ in groups]
+    with _plots.picture(figures / "temperature.png", 4.5, 3.4, 2) as (left, right):
+        _plots.curves(left, values["shift"], "temperature (C)", "focus (um)", styles=styles)
+        values["spots"][f"{first[0]}, refocused"] = values["spots"][first[0]][0], again
+        styles.append({"color": "C0", "linestyle": "--"})
+        _plots.curves(right, values["spots"], "temperature (C)", "RMS spot (um)", styles=styles)
+        right.set_ylim(0, 1.1 * right.get_ylim()[1])
+        right.legend(loc="lower center", fontsize=8)
+
+
+if __name__ == "__main__":
+    _command.main(sys.modules[__name__])
