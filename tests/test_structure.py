@@ -52,7 +52,7 @@ ROOMS = {
     "drt_jax/files": 3017,
     "drt_jax/image": 3043,
     "drt_jax/learn": 656,
-    "drt_jax/lens": 1566,
+    "drt_jax/lens": 1728,
     "drt_jax/pupil": 776,
     "drt_jax/rays": 1314,
     "drt_jax/show": 1178,
