@@ -41,12 +41,12 @@ ALLOWED = {
     "show": set(),
 }
 # Drawings of rays; and the namespace of `learn`.
-_DRAWN = "aberrations", "analyses", "glasses", "layout", "more", "prescription", "sheet"
-ALLOWED_ALL = {"learn.__init__", *(f"show.{name}" for name in (*_DRAWN, "tolerances"))}
+_DRAWN = "aberrations", "analyses", "configurations", "glasses", "layout", "more", "prescription"
+ALLOWED_ALL = {"learn.__init__", *(f"show.{name}" for name in (*_DRAWN, "sheet", "tolerances"))}
 # Most lines of code of each room; no blank, comment, docstring or import is counted. They
 # fall, and rise only by a new capability, whose commit says by how much: text is free, code is not.
 ROOMS = {
-    "drt_jax": 562,
+    "drt_jax": 572,
     "drt_jax/check": 298,
     "drt_jax/design": 3218,
     "drt_jax/files": 3017,
@@ -55,7 +55,7 @@ ROOMS = {
     "drt_jax/lens": 1728,
     "drt_jax/pupil": 776,
     "drt_jax/rays": 1314,
-    "drt_jax/show": 1178,
+    "drt_jax/show": 1261,
     "experiments": 490,
     "experiments/designing": 823,
     "experiments/imaging": 461,

@@ -177,18 +177,14 @@ def tables(results: dict[str, Any]) -> dict[str, str]:
 
 def draw(results: dict[str, Any], figures: pathlib.Path) -> None:
     """Draws start and end in all configurations, side by side at one scale, the sensors in line."""
-    rows, waves = results["rows"], results["wavelengths_um"]
-    drawings = []
-    for row in rows:
-        scene = Scene.degrees(row["fields_deg"], row["distance_mm"] or math.inf, waves)
-        for name in ("start", "designed"):
-            lens = drt_jax.load_lens(figures.parent / f"{name}_{row['configuration']}.yaml")
-            drawings.append((row, name, float(lens.sensor), show.draw(lens, scene)))
-    long = max(sensor for _, _, sensor, _ in drawings)
-    with _plots.picture(figures / "zoom.png", 7.0, 2.5, len(drawings), 2) as axes:
-        for ax, (row, name, sensor, drawing) in zip(axes, drawings, strict=True):
-            show.lens_drawing(ax, drawing)
-            ax.set_xlim(sensor - 1.12 * long, sensor + 0.03 * long)
+    panels = [(row, name) for row in results["rows"] for name in ("start", "designed")]
+    lenses, scenes, waves = [], [], results["wavelengths_um"]
+    for row, name in panels:
+        lenses.append(drt_jax.load_lens(figures.parent / f"{name}_{row['configuration']}.yaml"))
+        far = row["distance_mm"] or math.inf
+        scenes.append(Scene.degrees(row["fields_deg"], far, waves))
+    with _plots.picture(figures / "zoom.png", 5.8, 2.5, len(panels), 2) as axes:
+        for ax, (row, name) in zip(show.configurations(axes, lenses, scenes), panels):
             spot = math.hypot(*row[f"spots_um_{name}"]) / math.sqrt(len(row["fields_deg"]))
             focal = row[f"focal_mm_{name}"]
             ax.set_title(f"{name}, f = {focal:.1f} mm, spots {spot:.1f} um", fontsize=9)
