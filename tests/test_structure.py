@@ -57,7 +57,7 @@ ROOMS = {
     "drt_jax/rays": 1314,
     "drt_jax/show": 1261,
     "experiments": 490,
-    "experiments/designing": 823,
+    "experiments/designing": 835,
     "experiments/imaging": 461,
     "experiments/paper": 608,
     "experiments/runs": 453,
