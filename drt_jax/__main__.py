@@ -26,6 +26,7 @@ from .files.load import lens_names, load_lens, load_system
 from .files.write import save_lens
 from .image.converged import psf_moments
 from .image.diagnose import crossed
+from .inputs import require
 from .lens.lens import Lens
 from .lens.order import may_cross
 from .lens.paraxial import FirstOrder, first_order
@@ -34,10 +35,12 @@ from .pupil.clipped import Clipped
 from .pupil.rules import Gauss, Pattern, PupilRule, Symmetry, gauss_points, symmetry_of
 from .rays.status import Status
 from .show import glasses
+from .show.configurations import configuration_table, configurations
+from .show.figures import new
 from .show.layout import ENDS, Beam, beam_of
 from .show.more import more_panels
 from .show.page import Part, page
-from .show.prescription import prescription
+from .show.prescription import first_rows, prescription
 from .show.sheet import panels, sheet
 
 _LINES = (0.6562725, 0.5875618, 0.4861327)  # C, d, F
@@ -69,7 +72,8 @@ def _options(argv: list[str] | None) -> argparse.Namespace:
     own = "default: those of a .zmx or .seq file, else"
     ends = "default: those of a .zmx or .seq file with their weights, else"
     which = "number of a configuration or zoom position of a .zmx or .seq file, from 1"
-    show.add_argument("--configuration", type=int, help=which)
+    every = f"{which}; or all: their layouts under each other and a table of their numbers"
+    show.add_argument("--configuration", type=configuration, help=every)
     show.add_argument("--field", type=float, nargs="+", help=f"degrees; {own} 0 7 10")
     show.add_argument("--distance", type=float, help=f"to the object, mm; {own} inf")
     show.add_argument("--wavelengths", type=float, nargs="+", help=f"um; {ends} C, d and F")
@@ -94,28 +98,9 @@ def _options(argv: list[str] | None) -> argparse.Namespace:
     return parser.parse_args(argv)
 
 
-def first_rows(lens: Lens, found: FirstOrder, wavelength: float) -> Iterator[tuple[str, str]]:
-    """The first-order data of a lens at one wavelength, um: names and values."""
-    yield "wavelength", f"{wavelength:g} um"
-    air = float(found.effective_focal_length)
-    both = "" if math.isclose(air, abs(found.focal_length)) else f" ({air:.6g} mm in air)"
-    yield "focal length", f"{found.focal_length:.6g} mm{both} (EFL)"
-    yield "working f-number", f"f/{found.f_number:.4g}"
-    yield "back focal length", f"{found.back_focal_distance:.6g} mm (BFL)"
-    for name, image_of, end in (
-        ("entrance pupil", found.entrance_pupil, "first"),
-        ("exit pupil", found.exit_pupil, "last"),
-    ):
-        place = f"at {image_of.position + 0.0:.5g} mm from the {end} vertex"
-        yield name, f"diameter {2 * image_of.semi_diameter:.5g} mm, {place}"
-    yield "stop", f"surface {lens.stop}, diameter {2 * float(lens.semi_diameter[lens.stop]):.5g} mm"
-    yield "sensor", f"{float(lens.sensor):.6g} mm from the first vertex (total track)"
-    if lens.afocal:
-        far = float(found.image_distance) - float(lens.vertices[-2])
-        vergence = f"{1e3 / far if far else math.inf:.4g} dioptres behind the last vertex"
-        yield "vergence", f"{vergence}, 0 for collimated light"
-    else:
-        yield "paraxial focus", f"{found.image_distance:.6g} mm from the first vertex"
+def configuration(text: str) -> int | str:
+    """The number of a configuration, or "all"."""
+    return text if text == "all" else int(text)
 
 
 def focus_lines(found: FirstOrder, wavelength: float, axial: Beam) -> Iterator[str]:
@@ -249,15 +234,8 @@ def run_convert(options: argparse.Namespace) -> None:
 def _warnings_on_stdout() -> Iterator[None]:
     """Prints every warning as a line, once."""
     with warnings.catch_warnings():
-        warnings.simplefilter("always")
-        said = set()
-
-        def show(message: Warning | str, *_: object, **__: object) -> None:
-            if str(message) not in said:
-                said.add(str(message))
-                _print_line(f"  ! {message}")
-
-        warnings.showwarning = show
+        warnings.simplefilter("default")  # each once
+        warnings.showwarning = lambda message, *_, **__: _print_line(f"  ! {message}")
         yield
 
 
@@ -272,6 +250,13 @@ class _View(NamedTuple):
     wavelengths: list[float]
     weights: list[float]
     note: str = ""
+
+    @property
+    def scene(self) -> Scene:
+        """The scene."""
+        waves, weights = np.array(self.wavelengths), np.array(self.weights)
+        shown = Scene.degrees(self.fields, self.distance, waves, wavelength_weights=weights)
+        return checked_scene(self.lens, shown)
 
 
 def _view(options: argparse.Namespace) -> _View:
@@ -309,11 +294,13 @@ def run_show(options: argparse.Namespace) -> None:
     """Prints the data of a lens as they are computed, and draws its sheet."""
     if not all(abs(field) < 90 for field in options.field or ()):
         raise ValueError("--field: must be within 90 degrees")
+    if options.configuration == "all":
+        _show_all(options)
+        return
     with _warnings_on_stdout():
-        lens, fields, distance, waves, weights, note = _view(options)
-        middle = waves[len(waves) // 2]
-        shown = Scene.degrees(fields, distance, np.array(waves), wavelength_weights=weights)
-        scene = checked_scene(lens, shown)
+        view = _view(options)
+        lens, fields, distance, waves, _, note = view
+        scene, middle = view.scene, waves[len(waves) // 2]
         found = jax.tree.map(lambda a: a.item(), _first_order(lens, distance, np.array([middle])))
         about = f"{lens.count} surfaces, stop: surface {lens.stop} (counted from 0)"
         first = [*first_rows(lens, found, middle)]
@@ -330,22 +317,46 @@ def run_show(options: argparse.Namespace) -> None:
         out = options.out or pathlib.Path(f"{pathlib.Path(options.lens).stem}{kind}")
         symmetry, cut = symmetry_of(lens, scene.field), any(beam.clips for beam in beams)
         rule = Clipped(8, symmetry, 8, may_cross(lens)) if cut else Gauss(8, symmetry)
-        view = lens, scene, rule, _show_task
+        shown = lens, scene, rule, _show_task
         if web:
             rows = [row for row in table if not isinstance(row, str)]
             lines = [line for line in (*notes, *table) if isinstance(line, str) and line]
             parts: list[tuple[str, Part]] = [("First-order data", first), ("Spots and light", rows)]
             parts += [("Warnings", "\n".join(lines))] if lines else []
             used = np.max([beam.wide for beam in beams], axis=0)[:-1]
-            parts += [*prescription(lens, used).items(), *panels(*view).items()]
+            parts += [*prescription(lens, used).items(), *panels(*shown).items()]
             parts += [*more_panels(lens, scene, _show_task).items()] if options.all else []
             out.write_text(page(f"{lens.name}: {about}", parts), encoding="utf-8")
         else:
-            figure = sheet(*view)
+            figure = sheet(*shown)
             figure.text(0.01, 0.01, note.strip(" !"), fontsize=7)
             figure.savefig(out)
     size = f", {out.stat().st_size / 1024:.0f} kB" if web else ""
     _write([f"drawn in {out}{size}"])
+
+
+def _show_all(options: argparse.Namespace) -> None:
+    """Prints a table of all configurations of a file, and draws them under each other."""
+    path = pathlib.Path(options.lens)
+    several = path.suffix.lower() in (".zmx", ".seq")
+    require(several, f"--configuration all: {path.name} has one; expected a .zmx or .seq file")
+    with _warnings_on_stdout():
+        count = load_system(path, options.missing, 1).configurations
+        each = [vars(options) | {"configuration": k} for k in range(1, count + 1)]
+        views = [_view(argparse.Namespace(**own)) for own in each]
+        lenses, scenes = [view.lens for view in views], [view.scene for view in views]
+        title = f"{lenses[0].name or path.stem}: {count} configurations"
+        rows = _write([title, *configuration_table(lenses, scenes)])[1:]
+        figure, axes = new(count, width=6.5, height=2.4)
+        configurations([*np.ravel(axes)], lenses, scenes)
+    web = options.html or options.all
+    out = options.out or path.with_suffix(".html" if web else ".png").name
+    parts: list[tuple[str, Part]] = [("Configurations", rows), ("Layouts", figure)]
+    if web:
+        pathlib.Path(out).write_text(page(title, parts), encoding="utf-8")
+    else:
+        figure.savefig(out)
+    _write([f"drawn in {out}"])
 
 
 def run_check(options: argparse.Namespace) -> None:

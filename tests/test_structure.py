@@ -41,23 +41,23 @@ ALLOWED = {
     "show": set(),
 }
 # Drawings of rays; and the namespace of `learn`.
-_DRAWN = "aberrations", "analyses", "glasses", "layout", "more", "prescription", "sheet"
-ALLOWED_ALL = {"learn.__init__", *(f"show.{name}" for name in (*_DRAWN, "tolerances"))}
+_DRAWN = "aberrations", "analyses", "configurations", "glasses", "layout", "more", "prescription"
+ALLOWED_ALL = {"learn.__init__", *(f"show.{name}" for name in (*_DRAWN, "sheet", "tolerances"))}
 # Most lines of code of each room; no blank, comment, docstring or import is counted. They
 # fall, and rise only by a new capability, whose commit says by how much: text is free, code is not.
 ROOMS = {
-    "drt_jax": 580,
+    "drt_jax": 585,
     "drt_jax/check": 298,
-    "drt_jax/design": 3217,
-    "drt_jax/files": 3110,
+    "drt_jax/design": 3229,
+    "drt_jax/files": 3120,
     "drt_jax/image": 3043,
     "drt_jax/learn": 656,
-    "drt_jax/lens": 1578,
+    "drt_jax/lens": 1869,
     "drt_jax/pupil": 776,
     "drt_jax/rays": 1314,
-    "drt_jax/show": 1181,
+    "drt_jax/show": 1264,
     "experiments": 490,
-    "experiments/designing": 902,
+    "experiments/designing": 914,
     "experiments/imaging": 461,
     "experiments/paper": 608,
     "experiments/runs": 453,

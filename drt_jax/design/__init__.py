@@ -1,11 +1,16 @@
 """Designing a lens: variables, operands, least squares, many starts, tolerances."""
 
+from ..lens.bend import bent as bent, split as split
 from ..lens.insert import (
+    cemented as cemented,
     inserted as inserted,
     removed as removed,
     with_asphere as with_asphere,
+    with_dummy as with_dummy,
+    with_plate as with_plate,
     with_stop as with_stop,
 )
+from ..lens.join import joined as joined
 from ..lens.temperature import (
     ThermalModel as ThermalModel,
     at_temperature as at_temperature,

@@ -1,4 +1,4 @@
-"""Elements put into a lens, split and taken out, another stop, aspheric terms.
+"""Surfaces, elements and plates put into a lens and taken out, another stop, aspheric terms.
 
 All that a lens carries goes along: stop, apertures, phases, tilts and elements. Numbers of surfaces
 count from 0 in the lens that is given. Numbers may be traced, except where an error says otherwise.
@@ -47,7 +47,7 @@ def inserted(
     glass: between the pair, such as `find_glass("air")`; or the number of a medium of the lens,
         from 0 in front of the first surface. ValueError for the medium that is there.
     like: the surface whose form, curvature, conic and coefficients both have; None: `surface`, or
-        the first one.
+        the first one; -1 for two planes, see also `with_plate`.
     distance: (), mm along the light from the vertex of `surface` to the pair; in front of the lens
         from the pair to the first vertex.
     thickness: (), mm along the light between the pair. Surfaces that touch cannot be traced: both
@@ -58,7 +58,7 @@ def inserted(
     """
     (i,) = whole_numbers("surface", (surface,))
     i = -1 if i == -1 else _surface(lens, "surface", i)
-    row = max(i, 0) if like is None else _surface(lens, "like", like)
+    row = max(i, 0) if like is None else like if like == -1 else _surface(lens, "like", like)
     around = lens.glasses[i + 1]
     own = glass if isinstance(glass, int) else i + 1
     require(0 <= own <= lens.count, f"glass: expected a medium from 0 to {lens.count}, got {own}")
@@ -68,12 +68,12 @@ def inserted(
     rows = [*range(i + 1), -1, -1, *range(i + 1, lens.count + 1)]
     media = [*range(i + 2), own, *range(i + 1, lens.count + 1)]
     found, pair = reindexed(lens, rows, media, gaps), np.array([i + 1, i + 2])
-    names, forms = list(found.glasses), list(found.forms)
-    names[i + 2], forms[i + 1], forms[i + 2] = name, lens.forms[row], lens.forms[row]
-    shape = {
-        name: getattr(found, name).at[pair].set(getattr(lens, name)[row])
-        for name in ("curvature", "conic", "coefficients")
-    }
+    names, forms, shape = list(found.glasses), list(found.forms), {}
+    names[i + 2] = name
+    if row >= 0:
+        forms[i + 1] = forms[i + 2] = lens.forms[row]
+        for part in ("curvature", "conic", "coefficients"):
+            shape[part] = getattr(found, part).at[pair].set(getattr(lens, part)[row])
     dispersion = found.dispersion
     if not isinstance(glass, int):
         inside = np.arange(len(names)) == i + 2
@@ -100,6 +100,103 @@ def _gaps(lens: Lens, i: int, distance: Numbers, thickness: Numbers) -> tuple[Ar
     return jnp.concatenate([gaps[: max(i, 0)], *new, gaps[i + 1 :]]), (far + apart)[0]
 
 
+def with_plate(
+    lens: Lens,
+    surface: int,
+    glass: Glass,
+    distance: Numbers,
+    thickness: Numbers,
+    wavelength: Numbers = 0.5875618,
+) -> Lens:
+    """The lens with a plane plate, such as a filter or a cover glass, and all that stands behind it
+    moved away by the paraxial shift t (1 - n0 / n).
+
+    Paraxial rays of this wavelength are behind it what they were. `inserted` with `like=-1` puts in
+    the plate and moves nothing.
+
+    lens, surface, glass, distance, thickness: as in `inserted`; behind the last surface the
+        distance counts from there towards the sensor.
+    wavelength: (), um.
+    """
+    found, i = inserted(lens, surface, glass, -1, distance, thickness), surface
+    around, inside = found.index(wavelength)[i + 1 : i + 3, 0]
+    gaps, shift = found.thickness, found.thickness[i + 1] * (1 - around / inside)
+    gaps = gaps.at[i + 2].add(shift) if i + 2 < len(gaps) else gaps
+    return dataclasses.replace(found, thickness=gaps, sensor=found.sensor + shift)
+
+
+def with_dummy(
+    lens: Lens, surface: int, distance: Numbers = 0.0, curvature: Numbers | None = None
+) -> Lens:
+    """The lens with one surface more that changes no ray: a place for a stop, an aperture or a
+    phase, in air or inside of a glass.
+
+    `with_stop(with_dummy(lens, 3, 1.5), 4)` moves the stop there; `removed` takes it out.
+
+    lens: the lens.
+    surface: the new one is behind it, number `surface + 1`; -1 for one in front of the lens.
+    distance: (), mm along the light from the vertex of `surface` to the new one; in front of the
+        lens from the new one to the first vertex. It may leave the gap: the straight ray in the
+        medium there is extended to it.
+    curvature: (), 1/mm; None for a plane, which costs less.
+
+    All others and the sensor stay where they are. z and object distances count from the new first
+    surface.
+    """
+    (i,) = whole_numbers("surface", (surface,))
+    i = -1 if i == -1 else _surface(lens, "surface", i)
+    gaps, count = lens.thickness, lens.count
+    far = float(lens.senses[i + 1]) * real_array("distance", distance, gaps.dtype)[None]
+    around = gaps[max(i, 0) : i + 1]
+    new = [far, around - far] if 0 <= i < count - 1 else [far]
+    thickness = jnp.concatenate([gaps[: max(i, 0)], *new, gaps[i + 1 :]])
+    rows = [*range(i + 1), -1, *range(i + 1, count + 1)]
+    found = reindexed(lens, rows, [*range(i + 2), *range(i + 1, count + 1)], thickness)
+    if curvature is not None:
+        bend = found.curvature.at[i + 1].set(real_array("curvature", curvature, gaps.dtype))
+        curved = tuple(sorted({*found.curved, i + 1}))
+        found = dataclasses.replace(found, curvature=bend, curved=curved)
+    return dataclasses.replace(found, sensor=lens.sensor + (far[0] if i < 0 else 0))
+
+
+def _require_free(lens: Lens, out: Sequence[int]) -> None:
+    """ValueError for surfaces that cannot be taken out."""
+    gone, elements = set(out), lens.elements
+    kept = set() if elements is None else {*elements.about}.union(*elements.spans)
+    require(lens.stop not in gone, f"surfaces: {lens.stop} is the stop: see `with_stop`")
+    require(not any(lens.mirrors[i] for i in out), "surfaces: mirrors cannot be taken out")
+    require(not gone & kept, "surfaces: an element begins, ends or turns there")
+
+
+def cemented(lens: Lens, surface: int, curvature: Numbers | None = None) -> Lens:
+    """The lens with two elements cemented: their air gap is taken out, two faces become one, and
+    all that stands behind moves up by the gap.
+
+    lens: the lens.
+    surface: the last face of the first element, which stays, with its conic, terms and place. The
+        next face goes; the narrower of both apertures stays.
+    curvature: (), 1/mm, of the common face; None for the mean of both.
+
+    ValueError if there is no air between two glasses, for two of the same glass (`removed` takes
+    out their gap), and if the next face is the stop, a mirror or one where elements begin, end or
+    turn.
+    """
+    i, count = _surface(lens, "surface", surface), lens.count
+    front, gap, back = (*lens.glasses[i : i + 3], "", "")[:3]
+    fits = back and gap == "air" and gap not in (front, back) and front != back
+    require(fits, f"surface: {front}, {gap}, {back or 'the sensor'} cannot be cemented at {i}")
+    _require_free(lens, (i + 1,))
+    gaps, others = lens.thickness, [k for k in range(count + 1) if k != i + 1]
+    found = reindexed(lens, others, others, jnp.concatenate([gaps[:i], gaps[i + 1 :]]))
+    pair = jnp.mean(lens.curvature[i : i + 2]) if curvature is None else curvature
+    return dataclasses.replace(
+        found,
+        curvature=found.curvature.at[i].set(real_array("curvature", pair, gaps.dtype)),
+        semi_diameter=found.semi_diameter.at[i].set(jnp.min(lens.semi_diameter[i : i + 2])),
+        sensor=lens.sensor - gaps[i],
+    )
+
+
 def removed(lens: Lens, surfaces: Sequence[int]) -> Lens:
     """The lens without some surfaces. All others, and the sensor, stay where they are.
 
@@ -117,14 +214,10 @@ def removed(lens: Lens, surfaces: Sequence[int]) -> Lens:
     fits = together and out[0] >= 0 and out[-1] < count and len(out) < count
     require(fits, f"surfaces: expected some neighbours of 0 to {count - 1}, got {surfaces}")
     first, last, media = out[0], out[-1], lens.glasses
-    gone = set(out)
-    kept = set() if lens.elements is None else {*lens.elements.about}.union(*lens.elements.spans)
-    require(lens.stop not in gone, f"surfaces: {lens.stop} is the stop: see `with_stop`")
-    require(not any(lens.mirrors[i] for i in out), "surfaces: mirrors cannot be taken out")
-    require(not gone & kept, "surfaces: an element begins, ends or turns there")
+    _require_free(lens, out)
     what = f"surfaces: {media[first]} in front of {first}, {media[last + 1]} behind {last}"
     require(media[first] == media[last + 1], f"{what}: take out a whole element, or more")
-    rows = [i for i in range(count + 1) if i not in gone]
+    rows = [i for i in range(count + 1) if i not in out]
     gaps, before = lens.thickness, max(first - 1, 0)
     merged = jnp.sum(gaps[before : last + 1])[None] if first > 0 and last < count - 1 else gaps[:0]
     thickness = jnp.concatenate([gaps[:before], merged, gaps[last + 1 :]])

@@ -30,6 +30,10 @@ from .analyses import (
     seidel as seidel,
     spots as spots,
 )
+from .configurations import (
+    configuration_table as configuration_table,
+    configurations as configurations,
+)
 from .figures import kernels as kernels, new as new
 from .glasses import glass_map as glass_map
 from .layout import Drawing as Drawing, draw as draw, lens_drawing as lens_drawing

@@ -333,8 +333,11 @@ def _pierced(lens: Lens, y: np.ndarray) -> np.ndarray:
     return found
 
 
-def lens_drawing(axes: Axes, drawing: Drawing) -> Axes:
-    """Draw the polylines of `draw` on the axes of a figure."""
+def lens_drawing(axes: Axes, drawing: Drawing, half: bool = False) -> Axes:
+    """Draw the polylines of `draw` on the axes of a figure.
+
+    half: True for a half section, the part above the axis.
+    """
     for outline in drawing.glass:
         axes.fill(*outline.T, facecolor="#cfe4f5", edgecolor="#30506b", linewidth=0.8)
     for mirror in drawing.mirrors:
@@ -365,6 +368,8 @@ def lens_drawing(axes: Axes, drawing: Drawing) -> Axes:
     axes.set_aspect("equal")
     axes.margins(y=0.1)
     axes.set(xlabel="z from the first vertex (mm)", ylabel="y (mm)")
+    if half:
+        axes.set_ylim(bottom=0)
     return scale_bar(axes, "mm")
 
 

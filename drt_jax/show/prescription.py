@@ -1,13 +1,40 @@
-"""The prescription of a lens as rows of tables, from which it can be typed in again."""
+"""A lens as rows of tables: its first-order data, and the prescription, from which it can be typed
+in again."""
 
+import math
 from collections.abc import Iterator, Sequence
 
 import numpy as np
 
 from ..lens.forms import FORMS
 from ..lens.lens import Lens
+from ..lens.paraxial import FirstOrder
 
 Row = tuple[str, ...]
+
+
+def first_rows(lens: Lens, found: FirstOrder, wavelength: float) -> Iterator[tuple[str, str]]:
+    """The first-order data of a lens at one wavelength, um: names and values."""
+    yield "wavelength", f"{wavelength:g} um"
+    air = float(found.effective_focal_length)
+    both = "" if math.isclose(air, abs(found.focal_length)) else f" ({air:.6g} mm in air)"
+    yield "focal length", f"{found.focal_length:.6g} mm{both} (EFL)"
+    yield "working f-number", f"f/{found.f_number:.4g}"
+    yield "back focal length", f"{found.back_focal_distance:.6g} mm (BFL)"
+    for name, image_of, end in (
+        ("entrance pupil", found.entrance_pupil, "first"),
+        ("exit pupil", found.exit_pupil, "last"),
+    ):
+        place = f"at {image_of.position + 0.0:.5g} mm from the {end} vertex"
+        yield name, f"diameter {2 * image_of.semi_diameter:.5g} mm, {place}"
+    yield "stop", f"surface {lens.stop}, diameter {2 * float(lens.semi_diameter[lens.stop]):.5g} mm"
+    yield "sensor", f"{float(lens.sensor):.6g} mm from the first vertex (total track)"
+    if lens.afocal:
+        far = float(found.image_distance) - float(lens.vertices[-2])
+        vergence = f"{1e3 / far if far else math.inf:.4g} dioptres behind the last vertex"
+        yield "vergence", f"{vergence}, 0 for collimated light"
+    else:
+        yield "paraxial focus", f"{found.image_distance:.6g} mm from the first vertex"
 
 
 def prescription(lens: Lens, used: Sequence[float] = ()) -> dict[str, list[Row]]:

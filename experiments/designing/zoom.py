@@ -3,7 +3,8 @@
 The settings name what moves, with a value of its own in each configuration, and what all share.
 Writes the lens of each configuration, before and after, as YAML, and results.json: `rows` with
 `configuration`, `focal_mm`, `merit_start`, `merit_moved` (only what moves is optimised),
-`merit_end`, and `spots_um` of start and end.
+`merit_end`, and `spots_um` of start and end; with near objects also `magnification` and `breathing`
+of start and end.
 """
 
 import dataclasses
@@ -11,6 +12,7 @@ import math
 import pathlib
 import sys
 import time
+from collections.abc import Sequence
 from typing import Annotated, Any
 
 import jax.numpy as jnp
@@ -33,7 +35,8 @@ COLUMNS = ("merit", "worst", "jacobians")
 class Keep:
     """A value that each configuration keeps.
 
-    kind: an operand without rays. per_cent: by how much its value may change.
+    kind: an operand without rays; the magnification of near objects alone.
+    per_cent: by how much its value may change.
     """
 
     kind: OperandName
@@ -68,12 +71,13 @@ class Config:
 
 def problem_of(config: Config, system: System, vary: tuple[Vary, ...]) -> design.Problem:
     """The problem of one configuration. It keeps its f-number by a solve of its stop; what else it
-    keeps are limits about the values at the start."""
+    keeps are limits about the values at the start; no magnification of an object at infinity."""
     wave = float(system.wavelengths[system.primary])
     solve = design.Solve("f_number", distance=system.distance, wavelengths=(wave,))
     lens = design.open_apertures(system.lens)
     variables, kept = design.Variables.from_lens(lens, vary, solves=[solve]), []
-    for keep in config.keep:
+    far = math.isinf(system.distance)
+    for keep in (keep for keep in config.keep if not (far and keep.kind == "magnification")):
         alone = design.Problem.from_variables(variables, [keep.kind], system.scene)
         (value,) = np.asarray(alone.evaluate(variables.start).residuals).tolist()
         most = 0.01 * keep.per_cent * abs(value)
@@ -115,6 +119,15 @@ def spots_um(config: Config, lens: drt_jax.Lens, scene: Scene) -> list[float]:
     return [_common.spot_um(lens, point, config.tolerance, weights)[0] for point in points]
 
 
+def focusing(systems: list[System], lenses: Sequence[drt_jax.Lens]) -> design.Focusing:
+    """Magnification, and breathing where the largest field of the first configuration is imaged."""
+    scene, wave = systems[0].scene, systems[0].wavelengths[systems[0].primary]
+    point = dataclasses.replace(scene.at(scene.field[-1]), wavelengths=jnp.array([wave]))
+    point = dataclasses.replace(point, wavelength_weights=None)
+    height = drt_jax.image_point(lenses[0], point)[0, 1]
+    return design.focusing(lenses, [system.distance for system in systems], height, float(wave))
+
+
 def run(config: Config, run: Run) -> dict[str, Any]:
     """Optimises what moves, then all, and writes the lens of each configuration."""
     first = drt_jax.load_system(config.lens, configuration=1)
@@ -142,6 +155,11 @@ def run(config: Config, run: Run) -> dict[str, Any]:
             wave = system.wavelengths[system.primary :][:1]
             focal = drt_jax.first_order(lens, system.distance, wave).effective_focal_length
             row[f"focal_mm_{name}"] = float(focal[0])
+    if not all(math.isinf(system.distance) for system in systems):
+        for name, some in lenses.items():
+            seen = focusing(systems, some)
+            for row, *both in zip(rows, seen.magnification, seen.breathing, strict=True):
+                row[f"magnification_{name}"], row[f"breathing_{name}"] = map(float, both)
     for row, system in zip(rows, systems, strict=True):
         far = system.distance
         row["fields_deg"] = np.degrees(np.asarray(system.scene.field)[:, 1]).tolist()
@@ -153,11 +171,14 @@ def run(config: Config, run: Run) -> dict[str, Any]:
 
 def tables(results: dict[str, Any]) -> dict[str, str]:
     """Merit and spots of each configuration before and after, and the searches."""
-    header = ["configuration", "focal length, mm", "merit, mm^2, of the file", "gaps alone", "all"]
+    first = {"configuration": "configuration", "focal_mm_designed": "focal length, mm"}
+    if "magnification_designed" in results["rows"][0]:
+        first |= {"magnification_designed": "magnification", "breathing_designed": "breathing"}
+    header = [*first.values(), "merit, mm^2, of the file", "gaps alone", "all"]
     header += ["RMS um, of the file", "all"]
     rows = [
         [
-            *(row[key] for key in ("configuration", "focal_mm_designed")),
+            *(row[key] + 0 for key in first),  # no -0
             *(row[f"merit_{name}"] for name in ("start", "moved", "end")),
             *(
                 ", ".join(f"{um:.1f}" for um in row[f"spots_um_{name}"])
@@ -169,26 +190,23 @@ def tables(results: dict[str, Any]) -> dict[str, str]:
     keys = ("ended", "jacobians", "seconds", "compile_s", "worst")
     searches = [[name, *map(end.get, keys)] for name, end in results["searches"].items()]
     titles = ["search", "ended", "Jacobians", "seconds", "compilation, s", "the nearest limit"]
+    name = pathlib.Path(results["lens"]).stem
     return {
-        "zoom": _common.table(header, rows),
-        "zoom: searches": _common.table(titles, searches),
+        f"zoom, {name}": _common.table(header, rows),
+        f"zoom, {name}: searches": _common.table(titles, searches),
     }
 
 
 def draw(results: dict[str, Any], figures: pathlib.Path) -> None:
     """Draws start and end in all configurations, side by side at one scale, the sensors in line."""
-    rows, waves = results["rows"], results["wavelengths_um"]
-    drawings = []
-    for row in rows:
-        scene = Scene.degrees(row["fields_deg"], row["distance_mm"] or math.inf, waves)
-        for name in ("start", "designed"):
-            lens = drt_jax.load_lens(figures.parent / f"{name}_{row['configuration']}.yaml")
-            drawings.append((row, name, float(lens.sensor), show.draw(lens, scene)))
-    long = max(sensor for _, _, sensor, _ in drawings)
-    with _plots.picture(figures / "zoom.png", 7.0, 2.5, len(drawings), 2) as axes:
-        for ax, (row, name, sensor, drawing) in zip(axes, drawings, strict=True):
-            show.lens_drawing(ax, drawing)
-            ax.set_xlim(sensor - 1.12 * long, sensor + 0.03 * long)
+    panels = [(row, name) for row in results["rows"] for name in ("start", "designed")]
+    lenses, scenes, waves = [], [], results["wavelengths_um"]
+    for row, name in panels:
+        lenses.append(drt_jax.load_lens(figures.parent / f"{name}_{row['configuration']}.yaml"))
+        far = row["distance_mm"] or math.inf
+        scenes.append(Scene.degrees(row["fields_deg"], far, waves))
+    with _plots.picture(figures / "zoom.png", 5.8, 2.5, len(panels), 2) as axes:
+        for ax, (row, name) in zip(show.configurations(axes, lenses, scenes), panels):
             spot = math.hypot(*row[f"spots_um_{name}"]) / math.sqrt(len(row["fields_deg"]))
             focal = row[f"focal_mm_{name}"]
             ax.set_title(f"{name}, f = {focal:.1f} mm, spots {spot:.1f} um", fontsize=9)

@@ -83,3 +83,36 @@ def test_a_zoom_is_optimised_in_both_positions(tmp_path, monkeypatch, capsys):
         start = drt_jax.load_lens(tmp_path / "run" / f"start_{row['configuration']}.yaml")
         before = drt_jax.first_order(start, np.inf, np.array([0.55]))
         np.testing.assert_allclose(first.f_number, before.f_number, rtol=1e-9)
+
+
+@pytest.mark.slow
+def test_the_macro_lens_focuses_to_its_magnifications():
+    """The file's object distances and gaps: paraxial foci, in which the pictures of the groups are
+    infinity, 1:4 and 1:2."""
+    path = ROOT / zoom.Config().lens.replace("us5568323", "us5257137")
+    systems = [drt_jax.load_system(path, configuration=k) for k in (1, 2, 3)]
+    for system, wanted in zip(systems, (0, -0.25, -0.5)):
+        found = drt_jax.first_order(system.lens, system.distance, 0.5875618)
+        np.testing.assert_allclose(found.image_distance, system.lens.sensor, atol=7e-3)
+        np.testing.assert_allclose(found.magnification, wanted, atol=1e-5)
+    kept = [
+        [str(operand.kind) for operand in problem.operands] for problem in problems(systems[:2])
+    ]
+    assert ["magnification" in kinds for kinds in kept] == [False, True]
+
+
+def problems(systems):
+    keep = (zoom.Keep("magnification"),)
+    config = zoom.Config(keep=keep, operands=(zoom.Operand("air_centre", low=0.1),))
+    return [zoom.problem_of(config, system, config.moving) for system in systems]
+
+
+def test_tables_of_near_objects_have_magnification_and_breathing():
+    row = {"configuration": 1, "focal_mm_designed": 50.0}
+    row |= {f"merit_{name}": 0.1 for name in ("start", "moved", "end")}
+    row |= {f"spots_um_{name}": [1.0, 2.0] for name in ("start", "designed")}
+    results = {"lens": "a/b.zmx", "rows": [row], "searches": {}}
+    far, near = zoom.tables(results), row | {"magnification_designed": -0.5}
+    results["rows"] = [near | {"breathing_designed": -0.2}]
+    near = zoom.tables(results)["zoom, b"]
+    assert "magnification" not in far["zoom, b"] and "-0.5" in near and "breathing" in near
