@@ -49,7 +49,7 @@ ROOMS = {
     "drt_jax": 585,
     "drt_jax/check": 298,
     "drt_jax/design": 3229,
-    "drt_jax/files": 3120,
+    "drt_jax/files": 3118,
     "drt_jax/image": 3043,
     "drt_jax/learn": 656,
     "drt_jax/lens": 1869,

@@ -46,16 +46,14 @@ def choose(record: Record, found: list[Words], configuration: int | None) -> Non
 
 
 def _operands(found: list[Words], count: int) -> list[list[Words]]:
-    """The rows of each operand, one for each configuration."""
-    operands = []
-    for first in range(0, len(found), count):
-        rows = found[first : first + count]
-        named = {(words.key, *words.values[:1]) for words in rows}
-        numbers = [words.values[1:2] for words in rows if len(words.values) > 2]
-        if len(named) > 1 or numbers != [[str(k + 1)] for k in range(count)]:
-            break
-        operands.append(rows)
-    return operands
+    """The rows of each operand, one for each configuration, in any order."""
+    operands: dict[tuple[str, ...], dict[str, Words]] = {}
+    for words in found:
+        if len(words.values) > 2:
+            where, number = words.values[:2]
+            operands.setdefault((words.key, where), {})[number] = words
+    names = [str(k + 1) for k in range(count)]
+    return [[own[n] for n in names] for own in operands.values() if own.keys() >= {*names}]
 
 
 def _write(record: Record, found: list[Words], row: Words) -> None:

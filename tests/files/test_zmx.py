@@ -767,6 +767,10 @@ def test_each_configuration_is_read(tmp_path):
     np.testing.assert_array_equal(second.wavelengths, [0.5, 0.55])
     np.testing.assert_array_equal(second.wavelength_weights, [1, 7])
     assert (first.aperture, second.aperture) == (10, 8)
+    mixed = ("MNUM 2 1", *sorted(rows(*OPERANDS), key=lambda row: row.split()[2]))
+    again = read(tmp_path, tail=mixed, UNIT="MM", configuration=2)
+    np.testing.assert_array_equal(again.lens.curvature, second.lens.curvature)
+    assert (again.distance, again.lens.thickness[0], again.aperture) == (70, 5, 8)
     found = read(tmp_path, tail=("MNUM 2 1", *rows("SDIA 1 6 3")), ENPD=None, FLOA="",
                  configuration=2)  # fmt: skip
     assert found.lens.semi_diameter[0] == 3
