@@ -79,20 +79,36 @@ class System:
         ValueError unless the scene has one distance.
         """
         fields = np.asarray(scene.field, float).reshape(-1, 2)
-        waves, weights = np.asarray(scene.wavelengths, float), scene.wavelength_weights
+        waves = np.asarray(scene.wavelengths, float)
         distances = np.unique(np.asarray(scene.distance, float))
         require(len(distances) == 1, "scene: a file has one distance; make a system for each")
         primary = int(np.argsort(waves)[len(waves) // 2])
         far = abs(distances[0]) if np.isinf(distances[0]) else distances[0]
         place = float(entrance_pupil(lens, waves[primary]).position[0])
-        kind: FieldKind = "angle" if math.isfinite(place) else "object height"
+        kind: FieldKind = "object height" if math.isfinite(far) and math.isinf(place) else "angle"
         ratio = far / (far + place) if math.isfinite(far) else 1.0
-        seen = np.degrees(np.arctan(ratio * np.tan(fields)))
-        heights = seen if kind == "angle" else -far * np.tan(fields)
-        both = ((scene.field_weights, fields), (weights, waves))
-        own, parts = (np.ones(len(of)) if a is None else np.asarray(a, float) for a, of in both)
-        use = (heights, kind, own, np.zeros((len(fields), 5)), waves, parts, primary, None, None)
-        return cls(lens, float(far), fields, *use)
+        if kind == "angle":
+            heights = np.degrees(np.arctan(ratio * np.tan(fields)))
+        else:
+            heights = -far * np.tan(fields)
+
+        def weights(given: Array | None, count: int) -> np.ndarray:
+            return np.ones(count) if given is None else np.asarray(given, float)
+
+        return cls(
+            lens,
+            float(far),
+            fields,
+            heights,
+            kind,
+            field_weights=weights(scene.field_weights, len(fields)),
+            vignetting=np.zeros((len(fields), 5)),
+            wavelengths=waves,
+            wavelength_weights=weights(scene.wavelength_weights, len(waves)),
+            primary=primary,
+            aperture=None,
+            aperture_kind=None,
+        )
 
     @property
     def scene(self) -> Scene:

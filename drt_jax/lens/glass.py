@@ -176,12 +176,13 @@ def with_media(dispersion: Dispersion, rows: np.ndarray, other: Dispersion) -> D
         both = getattr(dispersion, name), getattr(other, name)
         if all(part is None for part in both):
             return None
-        old, new = (jnp.asarray(none) if a is None else a for a in both)
+        dtype = dispersion.schott.dtype
+        old, new = (jnp.asarray(none if a is None else a, dtype) for a in both)
         mask = np.reshape(rows, (-1, *(1,) * (new.ndim - 1)))
         if new.ndim == 2:
             width = max(old.shape[1], new.shape[1])
             old, new = (jnp.pad(a, ((0, 0), (0, width - a.shape[1]))) for a in (old, new))
-        return jnp.where(mask, new, old).astype(dispersion.schott.dtype)
+        return jnp.where(mask, new, old)
 
     nones = {"model": [_NO_MODEL], "partial": [0.0], "thermal": [[0.0] * 5]}
     names = (field.name for field in dataclasses.fields(Dispersion))

@@ -58,7 +58,8 @@ def inserted(
     """
     (i,) = whole_numbers("surface", (surface,))
     i = -1 if i == -1 else _surface(lens, "surface", i)
-    row = max(i, 0) if like is None else like if like == -1 else _surface(lens, "like", like)
+    row = max(i, 0) if like is None else like
+    row = -1 if row == -1 else _surface(lens, "like", row)
     around = lens.glasses[i + 1]
     own = glass if isinstance(glass, int) else i + 1
     require(0 <= own <= lens.count, f"glass: expected a medium from 0 to {lens.count}, got {own}")

@@ -122,12 +122,7 @@ def at_temperature(
     shapes = model.index.shape, model.surfaces.shape
     require(shapes == ((count + 1, 6), (count + 1,)), "model: of a lens with other surfaces")
     surfaces, gaps = (1 + 1e-6 * a * (now - _BUILT) for a in (model.surfaces, model.gaps))
-    air = jnp.asarray(media == "air")
-    d0, d1, d2, e0, e1, resonance = model.index.T
-    step = now - model.celsius
-    densities = air_density(model.celsius, jnp.ones_like(step)), air_density(now, pressed)
-    change = step * (d0 + step * (d1 + step * d2)), step * (e0 + step * e1), resonance**2
-    thermal = jnp.stack([*change, *(jnp.where(air, 0, a) for a in densities)], axis=1)
+    thermal = jnp.where((media == "air")[:, None], 0, _indices(model, now, pressed))
     name = f" at {float(now):g} C" if concrete(now) else ""
     glasses = tuple(m if m == "air" else m + name for m in lens.glasses)
     behind = _gaps(lens, surfaces, gaps)
@@ -159,6 +154,19 @@ def at_temperature(
         apertures=apertures,
         labels=Labels(lens.name, glasses),
     )
+
+
+def _indices(model: ThermalModel, now: Array, pressure: Array) -> Array:
+    """How the indices change, (S + 1, 5), see `Dispersion.thermal`: two terms of Schott's formula
+    and L_TK^2, and the densities of air that indices are relative to, before and now.
+
+    now, pressure: (), C and atmospheres.
+    """
+    d0, d1, d2, e0, e1, resonance = model.index.T
+    step = now - model.celsius
+    change = step * (d0 + step * (d1 + step * d2)), step * (e0 + step * e1), resonance**2
+    before, density = air_density(model.celsius, jnp.ones_like(step)), air_density(now, pressure)
+    return jnp.stack([*change, before, jnp.broadcast_to(density, step.shape)], axis=1)
 
 
 def _gaps(lens: Lens, surfaces: Array, gaps: Array) -> Array:

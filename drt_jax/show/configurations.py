@@ -1,7 +1,6 @@
 """Several configurations of one lens under each other, and a table of their numbers."""
 
 import dataclasses
-import math
 from collections.abc import Iterator, Sequence
 from itertools import count
 
@@ -10,10 +9,11 @@ import jax.numpy as jnp
 import numpy as np
 from matplotlib.axes import Axes
 
+from ..image.spots import spot_diagram
 from ..lens.lens import Lens
 from ..lens.paraxial import first_order
 from ..lens.scene import Scene, checked_scene
-from .layout import beam_of, draw, even_hits, lens_drawing
+from .layout import beam_of, draw, lens_drawing
 
 
 def configurations(
@@ -69,8 +69,8 @@ def configuration_table(
     yield "", "focal length", "f-number", "distance", "magnification", "track", "RMS spots"
     yield "", "mm", "", "mm", "", "mm", "urad by field" if angles else "um by field"
     for k, (lens, scene) in enumerate(zip(lenses, scenes, strict=True), 1):
-        places = [(math.degrees(point.field[1]), point) for point in scene.each()]
-        spots = [f"{angle:.4g}°: {1e3 * _spot(lens, point):.3g}" for angle, point in places]
+        found = zip(np.degrees(scene.field[..., 1]), 1e3 * spot_diagram(lens, scene).rms)
+        spots = [f"{angle:.4g}°: {rms:.3g}" for angle, rms in found]
         yield *_first_order(lens, scene, k), ", ".join(spots)
 
 
@@ -87,15 +87,3 @@ def _first_order(lens: Lens, scene: Scene, number: int) -> tuple[str, ...]:
         f"{found.magnification[0] + 0.0:.4g}",
         f"{float(lens.sensor):.6g}",
     )
-
-
-def _spot(lens: Lens, point: Scene) -> float:
-    """RMS radius of the spot of one object point in all wavelengths, mm; nan without light."""
-    hits = even_hits(lens, point)
-    weights = jnp.ones(len(hits)) if point.wavelength_weights is None else point.wavelength_weights
-    share = np.where(np.isfinite(hits[..., 0]), np.asarray(weights)[:, None], 0.0)
-    if not np.any(share):
-        return math.nan
-    hits = np.where(share[..., None] > 0, hits, 0.0)
-    centre = np.average(hits, axis=(0, 1), weights=np.stack([share, share], axis=-1))
-    return math.sqrt(np.average(np.sum((hits - centre) ** 2, axis=-1), weights=share))

@@ -52,6 +52,27 @@ def test_an_angle_in_a_file_is_seen_from_the_entrance_pupil(systems):
     assert np.degrees(near.fields[1, 1]) == 14 and near.heights[1, 1] != 14
 
 
+@pytest.mark.parametrize("distance", [np.inf, 80.0])
+def test_a_telecentric_lens_is_written(distance, tmp_path):
+    """Its entrance pupil is at infinity: a near object has heights, a far one angles."""
+    surfaces = [
+        {"radius": 50.0, "thickness": 5.0, "index": 1.5},
+        {"radius": -50.0, "thickness": 40.0},
+        {"radius": "inf", "thickness": 20.0, "stop": True, "semi_diameter": 4.0},
+    ]
+    lens = load_lens({"surfaces": surfaces})
+    focus = first_order(design.removed(design.with_stop(lens, 0), (2,)), np.inf, 0.55)
+    gap = focus.back_focal_distance[0]
+    lens = dataclasses.replace(lens, thickness=lens.thickness.at[1].set(gap))
+    assert np.isinf(first_order(lens, 80.0, 0.55).entrance_pupil[0][0])
+    scene = Scene.degrees([0, 3], distance, 0.55)
+    save_lens(System.of(lens, scene), tmp_path / "lens.zmx")
+    again = load_system(tmp_path / "lens.zmx")
+    np.testing.assert_allclose(again.scene.field, scene.field, atol=1e-15)
+    if np.isfinite(distance):
+        np.testing.assert_allclose(again.heights[1, 1], -80 * np.tan(np.radians(3)))
+
+
 def test_rows_are_those_of_a_patents_file(shared, tmp_path, capsys):
     """A zoom of another program's file: its gaps stand in the rows as they do there; through a
     `.seq` file, all three positions keep their focal lengths."""

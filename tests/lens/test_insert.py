@@ -140,3 +140,10 @@ def test_a_sphere_becomes_an_asphere_that_can_be_bent():
 def test_what_cannot_be_done_is_refused(change, told):
     with pytest.raises(ValueError, match=told):
         change(drt_jax.load_lens("cooke_triplet"))
+
+
+def test_a_lens_in_float32_stays_so():
+    """Also in a process of float64, for glasses of the catalogue."""
+    small = jax.tree.map(lambda a: a.astype(jnp.float32), drt_jax.load_lens("cooke_triplet"))
+    found = design.inserted(small, 1, drt_jax.find_glass("N-BK7"))
+    assert {leaf.dtype for leaf in jax.tree.leaves(found)} == {jnp.dtype("float32")}
