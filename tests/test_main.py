@@ -9,13 +9,14 @@ import numpy as np
 import pytest
 
 from drt_jax import Scene, first_order, load_lens, psf_moments, save_lens, show
-from drt_jax.__main__ import _options, _view, main
+from drt_jax.__main__ import _options, main
+from drt_jax.show.command import view_of
 
 
 @pytest.fixture
 def undrawn(monkeypatch):
     """Words without the sheet, which takes longer than they do; see tests/show/test_sheet.py."""
-    monkeypatch.setattr("drt_jax.__main__.sheet", lambda *_: show.new()[0])
+    monkeypatch.setattr("drt_jax.show.command.sheet", lambda *_: show.new()[0])
 
 
 @pytest.mark.slow
@@ -74,7 +75,7 @@ def test_what_is_known_is_said_before_the_rays_are_traced(monkeypatch, tmp_path,
         assert "focal length" in capsys.readouterr().out
         raise ValueError("reached")
 
-    monkeypatch.setattr("drt_jax.__main__.beam_of", stop)
+    monkeypatch.setattr("drt_jax.show.command.beam_of", stop)
     with pytest.raises(SystemExit):
         main(["show", "singlet", "--out", str(tmp_path / "lens.png")])
     assert capsys.readouterr().err == "error: reached\n"
@@ -177,19 +178,19 @@ def test_a_lens_file_is_shown_as_it_is_used(tmp_path):
         "PWAV 1", waves + "PWAV 1"
     )
     path.write_text(used.replace("FTYP 0 0 1 1", "FTYP 0 0 3 4"))
-    view = _view(_options(["show", str(path)]))
+    view = view_of(_options(["show", str(path)]))
     assert view.lens.count == 3 and view[1:3] == ([-2, 0, 3], 500)
     assert view[3:] == ([0.7, 0.6563, 0.5876, 0.4861], [1, 1, 1, 0.5], "")
     given = ["--field", "1", "--distance", "9e3", "--wavelengths", "0.5"]
-    assert _view(_options(["show", str(path), *given]))[1:] == ([1], 9e3, [0.5], [1], "")
+    assert view_of(_options(["show", str(path), *given]))[1:] == ([1], 9e3, [0.5], [1], "")
     more = path.read_text().replace("PWAV 1", "WAVM 5 0.55 1\nWAVM 6 0.6 1\nPWAV 1")
     path.write_text(more.replace("FTYP 0 0 3 4", "FTYP 0 0 3 6"))
-    view = _view(_options(["show", str(path)]))
+    view = view_of(_options(["show", str(path)]))
     assert view.wavelengths == [0.7, 0.5876, 0.4861]
     assert view.note == "  ! wavelengths of the file left out: 0.6563, 0.6, 0.55 um"
     path.write_text(re.sub("YFLN.*", "YFLN 0 0 0", path.read_text()))  # the axis alone
-    assert _view(_options(["show", str(path)]))[1] == [0]
-    view = _view(_options(["show", "singlet"]))
+    assert view_of(_options(["show", str(path)]))[1] == [0]
+    view = view_of(_options(["show", "singlet"]))
     assert view[1:4] == ([0, 7, 10], np.inf, [0.6562725, 0.5875618, 0.4861327])
 
 
@@ -197,7 +198,7 @@ def test_ctrl_c_is_one_line(monkeypatch, capsys):
     def stop(*args):
         signal.raise_signal(signal.SIGINT)
 
-    monkeypatch.setattr("drt_jax.__main__.load_lens", stop)
+    monkeypatch.setattr("drt_jax.show.command.load_lens", stop)
     with pytest.raises(SystemExit) as ended:
         main(["show", "singlet"])
     assert ended.value.code == 130 and capsys.readouterr().err == "stopped\n"

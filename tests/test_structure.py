@@ -41,21 +41,22 @@ ALLOWED = {
     "show": set(),
 }
 # Drawings of rays; and the namespace of `learn`.
-_DRAWN = "aberrations", "analyses", "configurations", "glasses", "layout", "more", "prescription"
-ALLOWED_ALL = {"learn.__init__", *(f"show.{name}" for name in (*_DRAWN, "sheet", "tolerances"))}
+_ANALYSES = "aberrations", "analyses", "command", "configurations", "glasses", "layout", "more"
+_DRAWN = (*_ANALYSES, "prescription", "sheet", "tolerances")
+ALLOWED_ALL = {"learn.__init__", *(f"show.{name}" for name in _DRAWN)}
 # Most lines of code of each room; no blank, comment, docstring or import is counted. They
 # fall, and rise only by a new capability, whose commit says by how much: text is free, code is not.
 ROOMS = {
-    "drt_jax": 585,
-    "drt_jax/check": 298,
-    "drt_jax/design": 3229,
-    "drt_jax/files": 3132,
-    "drt_jax/image": 3043,
+    "drt_jax": 364,
+    "drt_jax/check": 329,
+    "drt_jax/design": 3219,
+    "drt_jax/files": 3130,
+    "drt_jax/image": 3022,
     "drt_jax/learn": 656,
     "drt_jax/lens": 1872,
     "drt_jax/pupil": 776,
     "drt_jax/rays": 1314,
-    "drt_jax/show": 1255,
+    "drt_jax/show": 1450,
     "experiments": 490,
     "experiments/designing": 914,
     "experiments/imaging": 461,

@@ -1,19 +1,22 @@
-"""Runs the scenes of `drt-jax check`, and says on which machine."""
+"""`python -m drt_jax check`: runs the scenes, and says on which machine."""
 
+import argparse
 import concurrent.futures
 import dataclasses
 import importlib.metadata
+import json
 import os
 import pathlib
 import platform
 import subprocess
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from typing import Any
 
 import jax
 import numpy as np
 
+from ..inputs import require
 from . import scenes
 from .truth import TRUTHS
 
@@ -64,8 +67,7 @@ def _first(name: str) -> tuple[Row, scenes.Call | None]:
         call = getattr(scenes, name)()
         found = np.asarray(call(), float)
         wanted = np.array(TRUTHS[name].values)
-        if found.shape != wanted.shape:
-            raise ValueError(f"{found.shape} numbers instead of {wanted.shape}")
+        require(found.shape == wanted.shape, f"{found.shape} numbers instead of {wanted.shape}")
     except Exception as error:  # whatever it is belongs into the report
         return Row(name, message=f"{type(error).__name__}: {error}"), None
     apart, first = float(np.max(np.abs(found - wanted))), time.perf_counter() - began
@@ -125,6 +127,45 @@ def _own_version() -> str:
     except (OSError, subprocess.CalledProcessError):
         return f"{said}, a checkout"
     return f"{said}, commit {ran.stdout.strip()}"
+
+
+def arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of the command line."""
+    parser.add_argument("scenes", nargs="*", help=f"some of {', '.join(TRUTHS)}; default: all")
+    parser.add_argument("--json", type=pathlib.Path, help="a file for all of it, for a bug report")
+
+
+def told(options: argparse.Namespace, say: Callable[[str], None]) -> Iterator[str]:
+    """The scenes compared with their truth, as lines of a table; SystemExit with 1 if one is wrong.
+    say: called with the name of each step."""
+    names = options.scenes or [*TRUTHS]
+    if unknown := [name for name in names if name not in TRUTHS]:
+        raise ValueError(f"scenes: no {unknown[0]!r}; known: {', '.join(TRUTHS)}")
+    began, about, kept = time.perf_counter(), machine(), kept_programs()
+    yield from (*(f"{name:<11} {value}" for name, value in about.items()), "")
+    say("compiling and comparing: up to a minute and a half if nothing is kept")
+    found = [*rows(names)]
+    head = f"{'scene':<9}{'compared':<49}{'error':>8} {'allowed':<19}"
+    yield f"{head}{'first s':>7}{'again ms':>10}{'usual':>7}"
+    for row in found:
+        truth = TRUTHS[row.name]
+        line = f"{row.name:<9}{truth.about:<49}"
+        if row.error is None:
+            yield from (f"{line}  FAILED", f"  ! {row.message}")
+            continue
+        allowed = f"{truth.allowed:.1e} {truth.unit}"
+        times = f"{row.first:>7.1f}{row.again:>10.2g}{truth.usual:>7g}"
+        yield f"{line}{row.error:>8.1e} {allowed:<19}{times}  {'ok' if row.right else 'WRONG'}"
+        if not row.right:
+            yield f"  ! expected: {truth.source}; allowed: {truth.why}"
+    seconds, right = time.perf_counter() - began, sum(row.right for row in found)
+    new = "" if kept is None else f", {(kept_programs() or 0) - kept} programs compiled and kept"
+    yield from ("", f"{right} of {len(found)} scenes are right, in {seconds:.0f} s{new}")
+    if options.json:
+        text = json.dumps(report(found, about, seconds), indent=2)
+        options.json.write_text(text + "\n", encoding="utf-8")
+    if right < len(found):
+        raise SystemExit(1)
 
 
 def report(found: list[Row], about: dict[str, str], seconds: float) -> dict[str, Any]:

@@ -29,15 +29,9 @@ def failures(lens: Lens, rays: FieldRays) -> Array:
     failed = ~rays.arrives & (light > 0)
     root = jnp.sqrt(jnp.where(failed, light, 1))
     dark = rays.throughput[..., None] == 0
-    residual = jnp.where(failed, root * (1 + _shortfalls(lens, rays)), 0)
-    return jnp.where(dark, jnp.inf, residual)
-
-
-def _shortfalls(lens: Lens, rays: FieldRays) -> Array:
-    """Shortfall (V, W, Q) of the paraxial launch of each failed ray; 0 for a ray that arrives."""
-    failed = ~rays.arrives
 
     def of_view(field: Array, distance: Array, points: Vector) -> Array:
+        """Shortfall (W, Q) of the paraxial launch of each ray."""
         scene = Scene(field, distance, rays.wavelengths)
         system, target = aims(lens, scene, points)
         launch = paraxial_launch(system, target, beam_size(system, target)[1])
@@ -47,8 +41,9 @@ def _shortfalls(lens: Lens, rays: FieldRays) -> Array:
         return jax.vmap(of_view)(rays.field, rays.distance, rays.points)
 
     none = jnp.zeros_like(rays.weights)
-    found = jax.lax.cond(jnp.any(failed), of_all, lambda _: none, None)
-    return jnp.where(failed, found, 0)
+    found = jax.lax.cond(jnp.any(~rays.arrives), of_all, lambda _: none, None)
+    short = jnp.where(~rays.arrives, found, 0)
+    return jnp.where(dark, jnp.inf, jnp.where(failed, root * (1 + short), 0))
 
 
 def shortfall(system: System, launch: Vector, target: Vector) -> Array:

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from ..inputs import require_one_of, whole_numbers
+from ..inputs import require, require_one_of, whole_numbers
 from ..lens.lens import Lens
 from ..numerics import concrete, leaves, safe_sqrt
 from .field_rays import FieldRays
@@ -85,10 +85,8 @@ class Operand:
             raise ValueError(f"{what}: at: must be above 0 and finite, got {self.at:g}")
         if known.of_waves and not (self.target or self.limits):
             raise ValueError(f"{what}: target: 0 is no light; give 1 for the best, or limits")
-        if low == high:
-            raise ValueError(f"{what}: low and high are both {low:g}; give it as the target")
-        if not low < high:
-            raise ValueError(f"{what}: low {low:g} is not below high {high:g}; exchange them")
+        require(low != high, f"{what}: low and high are both {low:g}; give it as the target")
+        require(low < high, f"{what}: low {low:g} is not below high {high:g}; exchange them")
         if not 0 <= self.weight < math.inf:
             raise ValueError(
                 f"{what}: weight: must be above 0, or 0 to leave it out, got {self.weight:g}"
@@ -96,8 +94,7 @@ class Operand:
         if not self.vignetting and not (known.of_spots or callable(self.kind)):
             some = ", ".join(kind for kind, value in OPERANDS.items() if value.of_spots)
             raise ValueError(f"{what}: vignetting: is of {some}; leave it out")
-        if not math.isfinite(self.target):
-            raise ValueError(f"{what}: target: must be finite, got {self.target:g}")
+        require(math.isfinite(self.target), f"{what}: target: must be finite, got {self.target:g}")
         if self.target and self.limits:
             raise ValueError(f"{what}: has a target and limits; make two operands of it")
         if known.squared and (self.target or self.limits):

@@ -222,8 +222,11 @@ class Problem:
         lens = self.variables.lens_of(vector)
         rays = self._rays(lens)
         parts = [operand.residuals(lens, rays, self.field_weights) for operand in self.operands]
-        if self.traces:
-            parts.append(self._failures(lens, rays))
+        if self.traces:  # failed rays count in the unit of the operand with the largest weight
+            size = _FAILED * jax.lax.stop_gradient(lens.semi_diameter[lens.stop])
+            weights = [o.weight * kind_of(o.kind).per_mm for o in self.operands if not o.limits]
+            weight = jnp.max(jnp.stack(weights)) if weights else 1.0
+            parts.append(jnp.ravel(weight * size * failures(lens, rays)))
         residuals = jnp.concatenate(parts)
         constraints = self._constraints(lens, rays)
         radius = beam_radius(lens, rays) if self.traces else jnp.zeros(lens.count, vector.dtype)
@@ -242,15 +245,6 @@ class Problem:
     def _rays(self, lens: Lens) -> FieldRays:
         """The views of a lens, with rays if any operand needs them."""
         return trace_views(lens, self.views(), self.solver) if self.traces else self.views()
-
-    def _failures(self, lens: Lens, rays: FieldRays) -> Array:
-        """Residuals of failed rays, see `failures`, in the unit of the operand with the largest
-        weight.
-        """
-        size = _FAILED * jax.lax.stop_gradient(lens.semi_diameter[lens.stop])
-        weights = [o.weight * kind_of(o.kind).per_mm for o in self.operands if not o.limits]
-        weight = jnp.max(jnp.stack(weights)) if weights else 1.0
-        return jnp.ravel(weight * size * failures(lens, rays))
 
     def _constraints(self, lens: Lens, rays: FieldRays) -> Array:
         """The constraints (L,) of all operands."""

@@ -159,23 +159,18 @@ def _hits(rays: FieldRays) -> tuple[Array, Array]:
     return jnp.where(light[None] > 0, rays.sensor_hits[..., EXTRAS:], 0), light
 
 
-def _spread(rays: FieldRays, axes: tuple[int, ...]) -> Array:
-    """Distances of rays from the centroid over `axes`, times the root of their weight, (D, V, W,
-    Q), mm.
+def _spot(lens: Lens, rays: FieldRays, axes: tuple[int, ...] = (-2, -1)) -> Array:
+    """Residuals of "spot", (D, V, W, Q), mm: distances of rays from the centroid over `axes`, times
+    the root of their weight.
     """
     hits, light = _hits(rays)
     parts, _ = deviations(tuple(hits), normalised(light, axes), rays.symmetry, axes)
     return jnp.stack(parts) * safe_sqrt(light)[None]
 
 
-def _spot(lens: Lens, rays: FieldRays) -> Array:
-    """Residuals of "spot", (D, V, W, Q), mm."""
-    return _spread(rays, (-2, -1))
-
-
 def _spot_of_colours(lens: Lens, rays: FieldRays) -> Array:
     """Residuals of "spot_of_colours", (D, V, W, Q), mm."""
-    return _spread(rays, (-1,))
+    return _spot(lens, rays, (-1,))
 
 
 def _spot_chief(lens: Lens, rays: FieldRays) -> Array:

@@ -345,7 +345,10 @@ class Variables:
         lines = [f"{self.lens.name or 'lens'}: {counts}"]
         for kind in dict.fromkeys(place.kind for place in self.places):
             rows = [k for k, place in enumerate(self.places) if place.kind == kind]
-            each = [f"{_where(self.places[k])}{numbers[k]:.5g}" for k in rows[:_MOST_TOLD]]
+            names = [self.names[k].removeprefix(kind).strip() for k in rows[:_MOST_TOLD]]
+            each = [
+                f"{f'[{name}] ' if name else ''}{numbers[k]:.5g}" for k, name in zip(rows, names)
+            ]
             more = f", ... ({len(rows)})" if len(rows) > _MOST_TOLD else ""
             unit = f" ({_UNITS[kind]})" if kind in _UNITS else ""
             lines.append(f"  {kind}{unit}: {', '.join(each)}{more}")
@@ -403,12 +406,6 @@ class Variables:
         """
         now = jnp.asarray(celsius, self.low.dtype)
         return dataclasses.replace(self, environment=(now, model))
-
-
-def _where(place: Place) -> str:
-    """The surface and the term of a number, for a list of its kind."""
-    where = str(place).removeprefix(place.kind).strip()
-    return f"[{where}] " if where else ""
 
 
 def _refuse_twice(what: str, places: Iterable[Place], reason: str) -> None:

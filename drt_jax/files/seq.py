@@ -112,17 +112,6 @@ def _surface(reader: _Reader, command: Command) -> None:
             ON_SURFACES[key](own, dataclasses.replace(command, key=key, values=values))
 
 
-def _return(reader: _Reader, command: Command) -> None:
-    """RET Sn for the last surface, or RET Sk Sn for surface k."""
-    named = [first for letter, first, _ in command.qualifiers if letter == "S"]
-    what = "RET: expected the surface to return to, as RET S2"
-    command.require(1 <= len(named) <= 2, what)
-    own = reader.at(command, named[0]) if len(named) == 2 else len(reader.surfaces) - 1
-    command.require(reader.surfaces, "RET before any surface")
-    move(reader.surfaces[own], command)
-    reader.surfaces[own].target = reader.at(command, named[-1])
-
-
 def _zoom(reader: _Reader, command: Command) -> None:
     """`ZOO 3`, or a command with a value for each zoom position."""
     record, line, words = reader.record, command.line, command.values
@@ -175,7 +164,13 @@ def _take(reader: _Reader, command: Command) -> None:
             named = command.of("S")
             reader.stop = reader.at(command, named[0]) if named else len(reader.surfaces) - 1
         case "RET":
-            _return(reader, command)
+            own = [first for letter, first, _ in command.qualifiers if letter == "S"]
+            what = "RET: expected the surface to return to, as RET S2"
+            command.require(1 <= len(own) <= 2, what)
+            moved = reader.at(command, own[0]) if len(own) == 2 else len(reader.surfaces) - 1
+            command.require(reader.surfaces, "RET before any surface")
+            move(reader.surfaces[moved], command)
+            reader.surfaces[moved].target = reader.at(command, own[-1])
         case "ZOO":
             _zoom(reader, command)
         case key if key in SOLVES:

@@ -7,7 +7,8 @@ more rays.
 """
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -16,7 +17,7 @@ from jax import Array
 
 from ..lens.lens import Lens
 from ..lens.scene import Scene
-from ..numerics import einsum, safe_divide, safe_sqrt
+from ..numerics import batched, einsum, safe_divide, safe_sqrt
 from ..pupil.clipped import Clipped
 from ..pupil.patterns import disc, half_disc, meridian
 from ..pupil.rules import Gauss, Mask, Pattern, PupilRule, Symmetry, fits
@@ -89,6 +90,19 @@ class Beam:
         farther = step * jnp.sign(self._along_motion())
         curvature = safe_divide(self.curvature, 1 + farther * self.curvature)
         return dataclasses.replace(self, hits=hits, path=path, curvature=curvature)
+
+    def each(self, function: Callable[["Beam"], Any], focus: Array | None = None) -> Any:
+        """A function of one beam, of each of the beams (...) that these arrays hold.
+
+        focus: mm by which the sensor is moved back, (); or (Z,), an axis of results behind theirs.
+        """
+
+        axes = self.path.ndim - 2
+        if focus is None:
+            return batched(function, axes)(self)
+        moved = lambda beam, step: function(beam.refocused(step))  # noqa: E731
+        at = jax.vmap(moved, (None, 0)) if focus.ndim else moved
+        return batched(lambda beam: at(beam, focus), axes)(self)
 
     def on_sphere(self) -> tuple[Array, Array]:
         """Rays as plane waves whose directions point from the exit pupil to the spot.

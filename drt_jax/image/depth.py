@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from ..inputs import warn
+from ..inputs import require, warn
 from ..lens.lens import Lens
 from ..lens.scene import Scene, checked_scene, distance_array, vergence_of
 from ..numerics import Numbers, concrete, tensordot
@@ -78,8 +78,7 @@ def depth_moments(lens: Lens, scene: Scene, tolerance: float | None = None) -> D
     if not concrete(scene.distance):
         raise ValueError("inside jax.jit or jax.vmap the nodes cannot follow: give known distances")
     near, far = (float(end(scene.distance)) for end in (np.min, np.max))
-    if not 0 < near < far:
-        raise ValueError(f"expected 0 < near < far, got near {near!r} and far {far!r} mm")
+    require(0 < near < far, f"expected 0 < near < far, got near {near!r} and far {far!r} mm")
     low, high = 1 / far, 1 / near
     bound = tolerance
     if bound is None:

@@ -20,12 +20,12 @@ from jax import Array
 from ..compilation import LARGE, jit
 from ..lens.lens import Lens
 from ..lens.scene import Scene, checked_scene
-from ..numerics import Numbers, batched, einsum, safe_divide, safe_sqrt
+from ..numerics import Numbers, einsum, safe_divide, safe_sqrt
 from ..pupil.rules import PupilRule
 from .beam import Beam
 from .beam_psf import Sampling, ray_spots, spot_below
 from .refined import beams_of, to_tolerance
-from .transfer import Model, centre_of, places_of, planned, through_focus
+from .transfer import Model, centre_of, places_of, planned
 from .wave_psf import amplitudes, autocorrelation, period
 
 _UM = 1e3  # per mm
@@ -59,24 +59,22 @@ def encircled_energy(
     """
     scene, plan = checked_scene(lens, scene), planned(lens, scene, kind, sampling)
     values, steps = places_of(lens, "radii", radii, focus)
-    beams, axes = beams_of(lens, scene, plan.rule), len(scene.shape)
-    run = functools.partial(_encircled, model=plan.kind, axes=axes)
+    beams, run = beams_of(lens, scene, plan.rule), functools.partial(_encircled, model=plan.kind)
     known = lens, beams, (scene.wavelengths, values, scene.spectrum), steps
-    fewest = lambda *known: max(_LEAST, _cells(*known, axes=axes) if plan.kind == "waves" else 0)  # noqa: E731
+    fewest = lambda *known: max(_LEAST, _cells(*known) if plan.kind == "waves" else 0)  # noqa: E731
     return to_tolerance(run, known, plan.cells, plan.tolerance, fewest)
 
 
-@functools.partial(jit, wanted=LARGE, static_argnames=("model", "cells", "axes"))
+@functools.partial(jit, wanted=LARGE, static_argnames=("model", "cells"))
 def _encircled(
     lens: Lens, beams: Beam, asked: tuple[Array, Array, Array], focus: Array, model: Model,
-    cells: int, axes: int
+    cells: int
 ) -> Array:  # fmt: skip
-    """`encircled_energy` of beams with a number of leading axes, for a number of cells.
+    """`encircled_energy` of beams (...), for a number of cells.
 
     asked: wavelengths (W,), radii (N,) and spectrum (W,).
     """
-    one = lambda beam: encircled(lens, beam, *asked, model, cells)  # noqa: E731
-    return batched(lambda beam: through_focus(beam, focus, one), axes)(beams)
+    return beams.each(lambda beam: encircled(lens, beam, *asked, model, cells), focus)
 
 
 def encircled(
@@ -177,13 +175,10 @@ def _bessel(z: Array) -> Array:
     )
 
 
-@functools.partial(jit, wanted=LARGE, static_argnames="axes")
-def _cells(
-    lens: Lens, beams: Beam, asked: tuple[Array, Array, Array], focus: Array, axes: int
-) -> Array:
+@functools.partial(jit, wanted=LARGE)
+def _cells(lens: Lens, beams: Beam, asked: tuple[Array, Array, Array], focus: Array) -> Array:
     """Number of cells, (), for which all spots and circles fit into one period of the pattern."""
-    most = lambda beam: jnp.max(cells_needed(beam, *asked[:2]))  # noqa: E731
-    return jnp.max(batched(lambda beam: through_focus(beam, focus, most), axes)(beams))
+    return jnp.max(beams.each(lambda beam: cells_needed(beam, *asked[:2]), focus))
 
 
 def cells_needed(beam: Beam, wavelengths: Array, radii: Array) -> Array:

@@ -13,6 +13,7 @@ import numpy as np
 from jax import Array
 
 from ..compilation import LARGE, jit
+from ..inputs import require
 from ..lens.lens import Lens
 from ..lens.paraxial import first_order
 from ..lens.scene import Scene, checked_scene, over_points
@@ -95,11 +96,9 @@ def axial_colour(lens: Lens, scene: Scene, heights: Numbers = (0.7, 1.0)) -> Axi
     ValueError as of `lens.scene.checked_scene`.
     """
     points = real_array("heights", heights, lens.curvature.dtype)
-    if points.ndim != 1:
-        raise ValueError(f"heights: expected (N,), got shape {points.shape}")
+    require(points.ndim == 1, f"heights: expected (N,), got shape {points.shape}")
     scene = checked_scene(lens, scene)
-    if scene.distance.ndim:
-        raise ValueError(f"distance: expected one, got shape {scene.distance.shape}")
+    require(not scene.distance.ndim, f"distance: expected one, got shape {scene.distance.shape}")
     axis = scene.at(jnp.zeros(2, lens.curvature.dtype))
     warn_of_focus(lens, axis)
     hit, slope, _, good = _traced(lens, axis, points)

@@ -6,6 +6,7 @@ import numpy as np
 import optimistix as optx
 from jax import Array
 
+from ..inputs import require
 from ..lens.lens import Lens
 from ..lens.paraxial import image_height
 from ..lens.scene import Scene, checked_scene, over_points
@@ -58,10 +59,8 @@ def field_of_image(lens: Lens, point: Numbers, distance: Numbers, wavelength: Nu
     """
     scene = checked_scene(lens, Scene.point(0.0, distance, wavelength))
     target = real_array("point", point, lens.curvature.dtype)
-    if target.shape != (2,):
-        raise ValueError(f"point: expected x and y, got shape {target.shape}")
-    if scene.wavelengths.size > 1:
-        raise ValueError(f"wavelength: expected one, got {scene.wavelengths.size}")
+    require(target.shape == (2,), f"point: expected x and y, got shape {target.shape}")
+    require(scene.wavelengths.size <= 1, f"wavelength: expected one, got {scene.wavelengths.size}")
     return _field_of_image(lens, scene, target)
 
 

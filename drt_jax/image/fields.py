@@ -17,6 +17,7 @@ import numpy as np
 from jax import Array
 
 from ..compilation import LARGE, jit
+from ..inputs import require
 from ..lens.lens import Lens
 from ..lens.scene import Scene, checked_scene, over_points, vergence_of
 from ..numerics import Numbers, brief, einsum
@@ -246,11 +247,13 @@ def grid_method(
         lens, scene, pixel = known
         scene = checked_scene(lens, scene)
         pixel = check_pixels(pixel, 1, lens.curvature.dtype).side
-        _check_counts(size, nodes)
+        whole = isinstance(size, int | np.integer) and size > 0 and size % 2
+        require(size is None or whole, f"size: expected an odd number of pixels, got {size!r}")
+        enough = isinstance(nodes, int | np.integer) and nodes >= 2
+        require(enough, f"nodes: expected a whole number from 2 on, got {nodes!r}")
         far = np.ravel(np.asarray(scene.distance, float))
         wide = np.tan(np.max(np.abs(np.asarray(scene.field, float).reshape(-1, 2)), axis=0))
-        if not np.max(wide) > 0:
-            raise ValueError("fields: expected one beside the axis")
+        require(np.max(wide) > 0, "fields: expected one beside the axis")
         step = float(np.max(wide)) / nodes
         across, down = (max(2, int(np.ceil(a / step - 1e-9))) for a in wide)
         half = down, across
@@ -259,8 +262,7 @@ def grid_method(
         grid = Scene.grid(np.arctan(tangents), far, scene.wavelengths)
         found = _spots(lens, checked_scene(lens, grid))
         arrives = np.all(np.asarray(found.throughput) > 0, axis=-1)
-        if not np.any(arrives):
-            raise ValueError("fields: no light of any of them reaches the sensor")
+        require(np.any(arrives), "fields: no light of any of them reaches the sensor")
         if size is None:
             sigma = np.sqrt(np.diagonal(np.asarray(found.covariance), 0, -2, -1))[arrives]
             need = 2 * int(np.ceil(_REACH * np.max(sigma) / float(pixel))) + 1
@@ -277,15 +279,6 @@ def grid_method(
         step_, far_ = (jnp.asarray(a, lens.curvature.dtype) for a in (step, far))
         near = jnp.asarray(nearest, jnp.int32)
         return GridMethod(step_, far_, pixel, sampling, near, half, size, symmetry, together)
-
-
-def _check_counts(size: Any, nodes: Any) -> None:
-    """ValueError for an even kernel size or fewer than 2 nodes."""
-    whole = isinstance(size, int | np.integer) and size > 0 and size % 2
-    if size is not None and not whole:
-        raise ValueError(f"size: expected an odd number of pixels, got {size!r}")
-    if not isinstance(nodes, int | np.integer) or nodes < 2:
-        raise ValueError(f"nodes: expected a whole number from 2 on, got {nodes!r}")
 
 
 @functools.partial(jit, wanted=LARGE)

@@ -10,7 +10,7 @@ import numpy as np
 from jax import Array
 from jax.scipy.special import erf
 
-from ..inputs import require_one_of, warn
+from ..inputs import require, require_one_of, warn
 from ..numerics import Numbers, concrete, real_array, safe_sqrt
 from .spot import normalised
 
@@ -143,14 +143,11 @@ def check_pixels(pixel: Numbers, size: int, dtype: Any) -> Pixels:
     if not isinstance(size, int | np.integer) or size < 1:
         raise ValueError(f"size: expected a whole number of pixels, at least 1, got {size!r}")
     side = real_array("pixel", pixel, dtype)
-    if side.shape:
-        raise ValueError(f"pixel: expected one number, got shape {side.shape}")
+    require(not side.shape, f"pixel: expected one number, got shape {side.shape}")
     if concrete(pixel):
         known = np.asarray(pixel, float).item()
-        if not np.isfinite(known):
-            raise ValueError("pixel: must be finite")
-        if not known > 0:
-            raise ValueError(f"pixel: must be above 0 mm, got {known:g}")
+        require(np.isfinite(known), "pixel: must be finite")
+        require(known > 0, f"pixel: must be above 0 mm, got {known:g}")
         if known > _LARGE_PIXEL:
             um = f"if it is {known:g} um, give {1e-3 * known:g}"
             warn(f"pixel: {known:g} mm is a large one; {um}")

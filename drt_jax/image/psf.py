@@ -17,7 +17,7 @@ import numpy as np
 from jax import Array
 
 from ..compilation import LARGE, ONCE, jit
-from ..inputs import require_one_of, require_tolerance, warn
+from ..inputs import require, require_one_of, require_tolerance, warn
 from ..lens.lens import Lens
 from ..lens.scene import Scene, checked_scene
 from ..numerics import Numbers, known_values, real_array
@@ -168,8 +168,7 @@ def chosen_psf(
     """
     require_one_of("kind", kind, (*get_args(Kind), "auto"))
     require_tolerance(tolerance)
-    if norm not in (1, 2):
-        raise ValueError(f"norm: expected 1 or 2, got {norm!r}")
+    require(norm in (1, 2), f"norm: expected 1 or 2, got {norm!r}")
     known = require_known((lens, scene, pixel), "the cost of a kernel", "psf")
     with jax.core.eval_context():
         lens, scene, pixel = known
@@ -431,8 +430,7 @@ def gaussian_error(
     All numbers must be known. ValueError inside a trace, and as of `psf`.
     """
     known = known_values((lens, scene, pixel))
-    if known is None:
-        raise ValueError("gaussian_error compares known numbers: call it outside of jax.jit")
+    require(known is not None, "gaussian_error compares known numbers: call it outside of jax.jit")
     lens, scene, pixel = known
     fine, view = chosen_psf(lens, scene, pixel, size, "waves", tolerance)
     check_dtype(lens, "kernels", view.rounded, tolerance, "")

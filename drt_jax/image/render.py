@@ -22,7 +22,7 @@ import numpy as np
 from jax import Array
 
 from ..compilation import LARGE, jit
-from ..inputs import require_tolerance
+from ..inputs import require, require_tolerance
 from ..lens.lens import Lens
 from ..lens.paraxial import first_order
 from ..lens.scene import NEAREST, Scene, checked_scene, over_points, vergence_of
@@ -206,8 +206,7 @@ def render_method(
         side = float(check_pixels(pixel, 1, lens.curvature.dtype).side)
         waves = lens.checked_wavelengths(wavelengths).reshape(-1)
         focal = float(np.mean(np.asarray(first_order(lens, jnp.inf, waves).effective_focal_length)))
-        if not 0 < abs(focal) < np.inf:
-            raise ValueError("lens: without a focal length it makes no picture")
+        require(0 < abs(focal) < np.inf, "lens: without a focal length it makes no picture")
         far = layer_distances(distance, shape, layers)
         angles = _angles(lens, shape, far, side, focal, waves)
         given = lens, Scene.grid(angles[None], far, waves), side, size, nodes, kind

@@ -121,7 +121,7 @@ def spot_diagram(
     colour = scene.wavelengths[middle]
     index = lens.index(colour)[-1, 0]
     settings = spectrum / jnp.sum(spectrum), colour / index, middle
-    found = _spots(light, *settings, axes=len(scene.shape))
+    found = _spots(light, *settings)
     known = known_values((lens, found.rms))
     if known is not None:
         wrong = hit_rounding(known[0]) / max(float(jnp.min(known[1])), np.finfo(float).tiny)
@@ -241,18 +241,14 @@ def _fills(lens: Lens, scene: Scene) -> bool:
 def _extra_points() -> np.ndarray:
     """Stop points of rays without weight, (B, 2): the chief ray, the rim, and evenly over the
     whole stop."""
-    return np.concatenate([np.zeros((1, 2)), _rim(), _even()])
+    angle = 2 * np.pi * (np.arange(_RIM) + 0.25) / _RIM
+    rim = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    return np.concatenate([np.zeros((1, 2)), rim, _even()])
 
 
 def _even() -> np.ndarray:
     """Stop points evenly over the whole stop."""
     return hexapolar(_RINGS)[0]
-
-
-def _rim() -> np.ndarray:
-    """Stop points on the rim."""
-    angle = 2 * np.pi * (np.arange(_RIM) + 0.25) / _RIM
-    return np.stack([np.cos(angle), np.sin(angle)], axis=-1)
 
 
 @jax.tree_util.register_dataclass
@@ -387,13 +383,14 @@ def direction_determinant(jvp: Callable, points: Vector, field: Array, fixed: bo
     return determinant(columns)
 
 
-@functools.partial(jax.jit, static_argnames=("middle", "axes"))
-def _spots(light: _Light, spectrum: Array, wavelength: Array, middle: int, axes: int) -> Spots:
-    """`Spots` of light with a number of leading axes.
+@functools.partial(jax.jit, static_argnames="middle")
+def _spots(light: _Light, spectrum: Array, wavelength: Array, middle: int) -> Spots:
+    """`Spots` of the light of object points (...).
 
     wavelength: the reference wavelength in the medium of the sensor, um.
     """
-    return batched(lambda one: _spot(one, spectrum, wavelength, middle), axes)(light)
+    one = lambda light: _spot(light, spectrum, wavelength, middle)  # noqa: E731
+    return batched(one, light.throughput.ndim - 1)(light)
 
 
 def _spot(light: _Light, spectrum: Array, wavelength: Array, middle: int) -> Spots:

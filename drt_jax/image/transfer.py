@@ -13,8 +13,7 @@ short wavelengths it is the mean of exp(-2 pi i f.x) over rays.
 """
 
 import functools
-from collections.abc import Callable
-from typing import Any, Literal, NamedTuple, cast, get_args
+from typing import Literal, NamedTuple, cast, get_args
 
 import jax
 import jax.numpy as jnp
@@ -22,10 +21,10 @@ import numpy as np
 from jax import Array
 
 from ..compilation import LARGE, jit
-from ..inputs import require_one_of, require_tolerance
+from ..inputs import require, require_one_of, require_tolerance
 from ..lens.lens import Lens
 from ..lens.scene import Scene, checked_scene
-from ..numerics import Numbers, batched, einsum, real_array, safe_divide, safe_sqrt
+from ..numerics import Numbers, einsum, real_array, safe_divide, safe_sqrt
 from ..pupil.rules import PupilRule
 from .beam import Beam, BeamRule, beam_rule
 from .beam_psf import DEGREE, Sampling
@@ -90,7 +89,7 @@ def transfer(
     scene, plan = checked_scene(lens, scene), planned(lens, scene, kind, sampling)
     values, steps = places_of(lens, "frequencies", frequencies, focus)
     beams = beams_of(lens, scene, plan.rule)
-    run = functools.partial(_transfer, model=plan.kind, axes=len(scene.shape))
+    run = functools.partial(_transfer, model=plan.kind)
     known = lens, beams, (scene.wavelengths, values, scene.spectrum), steps
     otf, limit = to_tolerance(run, known, plan.cells, plan.tolerance, lambda *_: 0)
     return Transfer(values, otf, limit)
@@ -140,10 +139,8 @@ def places_of(lens: Lens, name: str, places: Numbers, focus: Numbers) -> tuple[A
     """Frequencies or radii (N,), with their name for messages, and focus () or (Z,), as arrays."""
     dtype = lens.curvature.dtype
     values, steps = real_array(name, places, dtype), real_array("focus", focus, dtype)
-    if values.ndim != 1:
-        raise ValueError(f"{name}: expected (N,), got shape {values.shape}")
-    if steps.ndim > 1:
-        raise ValueError(f"focus: expected one number or (Z,), got shape {steps.shape}")
+    require(values.ndim == 1, f"{name}: expected (N,), got shape {values.shape}")
+    require(steps.ndim <= 1, f"focus: expected one number or (Z,), got shape {steps.shape}")
     return values, steps
 
 
@@ -161,14 +158,13 @@ def strehl(lens: Lens, scene: Scene, sampling: float | PupilRule | Sampling | No
     scene = checked_scene(lens, scene)
     plan = planned(lens, scene, "waves", sampling)
     arrays = lens, beams_of(lens, scene, plan.rule), scene.wavelengths
-    run = functools.partial(_strehl, axes=len(scene.shape))
-    return to_tolerance(run, arrays, plan.cells, plan.tolerance, lambda *_: 0)
+    return to_tolerance(_strehl, arrays, plan.cells, plan.tolerance, lambda *_: 0)
 
 
-@functools.partial(jit, wanted=LARGE, static_argnames=("cells", "axes"))
-def _strehl(lens: Lens, beams: Beam, wavelengths: Array, cells: int, axes: int) -> Array:
-    """`strehl` of beams with a number of leading axes, for a number of cells."""
-    return batched(lambda beam: strehl_of(lens, beam, wavelengths, cells), axes)(beams)
+@functools.partial(jit, wanted=LARGE, static_argnames="cells")
+def _strehl(lens: Lens, beams: Beam, wavelengths: Array, cells: int) -> Array:
+    """`strehl` of beams (...), for a number of cells."""
+    return beams.each(lambda beam: strehl_of(lens, beam, wavelengths, cells))
 
 
 def strehl_of(lens: Lens, beam: Beam, wavelengths: Array, cells: int) -> Array:
@@ -192,24 +188,16 @@ def strehl_of(lens: Lens, beam: Beam, wavelengths: Array, cells: int) -> Array:
     return jnp.where(lit, total.real**2 + total.imag**2, 0)
 
 
-@functools.partial(jit, wanted=LARGE, static_argnames=("model", "cells", "axes"))
+@functools.partial(jit, wanted=LARGE, static_argnames=("model", "cells"))
 def _transfer(
     lens: Lens, beams: Beam, asked: tuple[Array, Array, Array], focus: Array, model: Model,
-    cells: int, axes: int
+    cells: int
 ) -> tuple[Array, Array]:  # fmt: skip
-    """`transfer` of beams with a number of leading axes, for a number of cells: otf and limit.
+    """`transfer` of beams (...), for a number of cells: otf and limit.
 
     asked: wavelengths (W,), frequencies (N,) and spectrum (W,).
     """
-    one = lambda beam: transfer_of(lens, beam, *asked, model, cells)  # noqa: E731
-    return batched(lambda beam: through_focus(beam, focus, one), axes)(beams)
-
-
-def through_focus(beam: Beam, focus: Array, of: Callable[[Beam], Any]) -> Any:
-    """A function `of` the beam with the sensor moved back by `focus` mm, (); or for each of
-    (Z,), as a first axis."""
-    moved = lambda step: of(beam.refocused(step))  # noqa: E731
-    return jax.vmap(moved)(focus) if focus.ndim else moved(focus)
+    return beams.each(lambda beam: transfer_of(lens, beam, *asked, model, cells), focus)
 
 
 def centre_of(beam: Beam, spectrum: Array) -> tuple[Array, Array]:

@@ -3,6 +3,7 @@ clipping of the beam of a field by the apertures.
 """
 
 import dataclasses
+import functools
 import itertools
 import math
 from collections.abc import Sequence
@@ -154,6 +155,7 @@ class _Traced(NamedTuple):
     clips: np.ndarray
 
 
+@functools.partial(jit, wanted=ONCE)
 def _in_own_axes(lens: Lens, points: jax.Array, directions: jax.Array) -> tuple[jax.Array, ...]:
     """Hits, directions and clips of `_Traced`, of points and directions along the axes of the
     lens."""
@@ -168,15 +170,12 @@ def _in_own_axes(lens: Lens, points: jax.Array, directions: jax.Array) -> tuple[
     return hits, directions, clips
 
 
-_own = jit(_in_own_axes, ONCE)
-
-
 def _traced(lens: Lens, scene: Scene, pupil: np.ndarray) -> _Traced:
     """Rays of one wavelength through points (Q, 2) of the stop, in units of its radius."""
     filled = np.resize(pupil, (-(-len(pupil) // _RAYS) * _RAYS, 2))
     rays = trace_rays(lens, scene, jnp.asarray(filled, lens.curvature.dtype))
     points = rays.points[0]
-    hits, directions, clips = _own(lens, points, rays.directions[0, :, -1])
+    hits, directions, clips = _in_own_axes(lens, points, rays.directions[0, :, -1])
     found = points, hits, directions, rays.status[0], clips
     return _Traced(*(np.asarray(a)[: len(pupil)] for a in found))
 
