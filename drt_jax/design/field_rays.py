@@ -27,6 +27,8 @@ from ..rays.trace import Bundle, aims, bundle_of, trace_bundle
 # rim of the stop. They have no weight.
 _EXTRA = np.array([[0.0, 0.0, 0.0, 1.0], [0.0, 1.0, -1.0, 0.0]])
 EXTRAS = _EXTRA.shape[1]
+# The fields of `FieldRays` that a trace fills in.
+_TRACED = "bundle", "points", "stop_weights", "weights", "throughput"
 
 
 def symmetry_by_structure(lens: Lens, axial: bool = False) -> Symmetry:
@@ -123,8 +125,12 @@ class FieldRays:
             """Selects from arrays (V, W) and (V, ..., W, Q)."""
             return jax.tree.map(lambda a: a[views][..., *[waves, slice(None)][: a.ndim - 1]], tree)
 
-        shares = self.wavelength_weights[waves]
-        found = dataclasses.replace(
+        shares, traced = self.wavelength_weights[waves], dict[str, Any]()
+        if self.bundle is not None:
+            traced = {name: selected(getattr(self, name)) for name in _TRACED[1:]}
+            bundle = selected(self.bundle._replace(steps=self.throughput))
+            traced["bundle"] = bundle._replace(steps=self.bundle.steps[views])
+        return dataclasses.replace(
             self,
             field=self.field[views],
             distance=self.distance[views],
@@ -132,17 +138,7 @@ class FieldRays:
             wavelength_weights=shares / jnp.sum(shares),
             fields=len(fields) or self.fields,
             distances=len(distances) or self.distances,
-        )
-        if self.bundle is None:
-            return found
-        bundle = selected(self.bundle._replace(steps=self.throughput))
-        return dataclasses.replace(
-            found,
-            bundle=bundle._replace(steps=self.bundle.steps[views]),
-            points=selected(self.points),
-            stop_weights=selected(self.stop_weights),
-            weights=selected(self.weights),
-            throughput=selected(self.throughput),
+            **traced,
         )
 
     def unvignetted(self) -> "FieldRays":
@@ -177,15 +173,9 @@ def trace_views(lens: Lens, views: FieldRays, solver: Solver) -> FieldRays:
         part = safe_divide(light, jnp.broadcast_to(throughput[:, None], light.shape))
         return bundle, points, weights, part, throughput
 
-    bundle, points, stop_weights, weights, throughput = jax.vmap(one)(views.field, views.distance)
-    return dataclasses.replace(
-        views,
-        bundle=bundle,
-        points=points,
-        stop_weights=stop_weights,
-        weights=weights,
-        throughput=throughput,
-    )
+    found = jax.vmap(one)(views.field, views.distance)
+    traced: dict[str, Any] = dict(zip(_TRACED, found, strict=True))
+    return dataclasses.replace(views, **traced)
 
 
 def _points(rule: PupilRule, lens: Lens, scene: Scene) -> tuple[Vector, Array]:

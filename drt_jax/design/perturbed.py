@@ -201,12 +201,7 @@ KINDS: dict[str, Kind] = {
     ),
     "wedge": Kind("surface", 2, "arc min", _active, partial(_with_part, "tilt", _MINUTE)),
     "thickness": Kind(
-        "surface",
-        1,
-        "mm",
-        PARTS["thickness"].rows,
-        partial(_with_part, "thickness", 1),
-        why_none=_NO_GAP,
+        "surface", 1, "mm", _gaps, partial(_with_part, "thickness", 1), why_none=_NO_GAP
     ),
     "index": Kind("surface", 1, "", _pieces, partial(_with_glass, "index"), why_none=_NO_GLASS),
     "abbe": Kind("surface", 1, "%", _pieces, partial(_with_glass, "abbe"), 100, _NO_GLASS),

@@ -228,7 +228,7 @@ class Problem:
             weight = jnp.max(jnp.stack(weights)) if weights else 1.0
             parts.append(jnp.ravel(weight * size * failures(lens, rays)))
         residuals = jnp.concatenate(parts)
-        constraints = self._constraints(lens, rays)
+        constraints = jnp.concatenate(self._constraints(lens, rays))
         radius = beam_radius(lens, rays) if self.traces else jnp.zeros(lens.count, vector.dtype)
         both = [gaps(lens, radius, glass) for glass in (True, False)]
         overlap = sum(jnp.sum(jnp.maximum(-part, 0)) for pair in both for part in pair)
@@ -246,9 +246,9 @@ class Problem:
         """The views of a lens, with rays if any operand needs them."""
         return trace_views(lens, self.views(), self.solver) if self.traces else self.views()
 
-    def _constraints(self, lens: Lens, rays: FieldRays) -> Array:
-        """The constraints (L,) of all operands."""
-        return jnp.concatenate([operand.constraints(lens, rays) for operand in self.operands])
+    def _constraints(self, lens: Lens, rays: FieldRays) -> list[Array]:
+        """The constraints of each operand, (L,) in all."""
+        return [operand.constraints(lens, rays) for operand in self.operands]
 
     def limits(self, constraints: Numbers) -> list[Limit]:
         """The limits by name, in the order of `Evaluation.constraints`.
@@ -257,13 +257,9 @@ class Problem:
         """
         counts = self._counts | {"xy": 2 if self.rule.symmetry == "none" else 1}
         lens, sizes = self.variables.lens, [0] * len(self.operands)
-
-        def constraints_of_each(lens: Lens) -> list[Array]:
-            rays = self._rays(lens)
-            return [operand.constraints(lens, rays) for operand in self.operands]
-
         if any(callable(operand.kind) for operand in self.operands):
-            sizes = [a.size for a in jax.eval_shape(constraints_of_each, lens)]
+            each = jax.eval_shape(lambda lens: self._constraints(lens, self._rays(lens)), lens)
+            sizes = [a.size for a in each]
         return limits_of(self.operands, lens, counts, sizes, np.asarray(constraints))
 
     def _refuse_fixed(self) -> None:
@@ -306,7 +302,8 @@ def trace_fields(problem: Problem, lens: Lens) -> FieldRays:
 @jax.jit
 def _exceeded(problem: Problem, vector: Array) -> Array:
     """Constraints (L,) of a problem without rays, at a vector (N,)."""
-    return problem._constraints(problem.variables.lens_of(vector), problem.views())
+    lens = problem.variables.lens_of(vector)
+    return jnp.concatenate(problem._constraints(lens, problem.views()))
 
 
 _exceeded_slopes = jax.jit(jax.jacfwd(_exceeded, argnums=1))

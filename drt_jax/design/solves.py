@@ -6,7 +6,7 @@ import copy
 import dataclasses
 import math
 from collections.abc import Callable, Sequence
-from typing import Any, Literal, NamedTuple, get_args
+from typing import Any, Literal, get_args
 
 import jax
 import jax.numpy as jnp
@@ -171,7 +171,7 @@ class Solve:
 
     def converted(self, value: Any) -> Any:
         """A value of the condition as a measure, or a measure as a value: itself or 1 / value."""
-        if not _CONDITIONS[self.kind].inverse:
+        if self.kind not in _INVERSE:
             return value
         if isinstance(value, float):
             return 1 / value if value else math.inf
@@ -181,8 +181,8 @@ class Solve:
     def rate(self, lens: Lens, other: "Solve") -> Array:
         """Derivative () of this condition by the solved number of another solve."""
         number, with_number = number_at(lens, other.place(lens))
-        measure, one = _CONDITIONS[self.kind].measure, jnp.ones_like(number)
-        return jax.jvp(lambda n: measure(with_number(n), self), (number,), (one,))[1]
+        one = jnp.ones_like(number)
+        return jax.jvp(lambda n: _measure(with_number(n), self), (number,), (one,))[1]
 
     def apply(self, lens: Lens) -> Lens:
         """The lens with the solved number; unchanged if no number meets the condition."""
@@ -211,34 +211,22 @@ def fix_solves(lens: Lens, solves: Sequence[Solve]) -> tuple[tuple[Solve, ...], 
 
 @program
 def _measure(lens: Lens, solve: Solve) -> Array:
-    """The measure () of a condition, see `_Condition`."""
-    return _CONDITIONS[solve.kind].measure(lens, solve)
+    """The measure () of a condition, see `_MEASURES`."""
+    return _MEASURES[solve.kind](lens, solve)
 
 
 @program
 def _met(lens: Lens, solve: Solve) -> Array:
     """The solved number (), by Newton's method on measure - value = 0."""
     number, with_number = number_at(lens, solve.place(lens))
-    measure = _CONDITIONS[solve.kind].measure
 
     def miss(number: Array) -> Array:
-        return measure(with_number(number), solve) - solve.converted(solve.value)
+        return _measure(with_number(number), solve) - solve.converted(solve.value)
 
     for _ in range(_STEPS):
         missed, rate = jax.jvp(miss, (number,), (jnp.ones_like(number),))
         number = number - safe_divide(missed, rate)
     return number
-
-
-class _Condition(NamedTuple):
-    """A condition.
-
-    measure: function of the lens and the solve, linear in the solved number.
-    inverse: True if the measure is 1 / `Solve.value`.
-    """
-
-    measure: Callable[[Lens, Solve], Array]
-    inverse: bool
 
 
 def _wavelengths(lens: Lens, solve: Solve) -> Array:
@@ -266,13 +254,16 @@ def _pupil(lens: Lens, solve: Solve) -> Array:
     return 2 * jnp.mean(entrance_pupil(lens, _wavelengths(lens, solve)).semi_diameter)
 
 
-_CONDITIONS = {
-    "focal_length": _Condition(_power, True),
-    "effective_focal_length": _Condition(_power, True),
-    "image_angle": _Condition(_slope, False),
-    "entrance_pupil": _Condition(_pupil, False),
-    "f_number": _Condition(lambda lens, solve: 2 * jnp.abs(_slope(lens, solve)), True),
+# Functions of the lens and the solve, linear in the solved number: the value of a condition, or, of
+# those in `_INVERSE`, 1 / value.
+_MEASURES: dict[str, Callable[[Lens, Solve], Array]] = {
+    "focal_length": _power,
+    "effective_focal_length": _power,
+    "image_angle": _slope,
+    "entrance_pupil": _pupil,
+    "f_number": lambda lens, solve: 2 * jnp.abs(_slope(lens, solve)),
 }
+_INVERSE = "focal_length", "effective_focal_length", "f_number"
 
 
 @program

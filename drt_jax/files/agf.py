@@ -114,19 +114,14 @@ def _glass(record: Record, block: dict[str, Words]) -> Glass | None:
     sellmeier, schott = makes(values)
     low, high = ends.numbers(0, 2)
     ends.require(0 < low < high, f"{called}: no range: {low:g} to {high:g} um")
-    more = _thermal(block) | {"status": _STATUS.get(int(head.number(6, -1.0)), "")}
+    more: dict[str, Any] = {"status": _STATUS.get(int(head.number(6, -1.0)), "")}
+    if "TD" in block:
+        *thermal, celsius = (block["TD"].number(at, 20.0 if at == 6 else 0.0) for at in range(7))
+        more |= {"thermal": tuple(thermal) if any(thermal) else (), "celsius": celsius}
+    expansion = block["ED"].number(0, 0.0) if "ED" in block else 0.0
+    more["expansion"] = expansion if expansion > 0 else None
     glass = Glass(name, tuple(sellmeier), tuple(schott), (low, high), **more)
     if wrong := flaw(glass):
         record.lacks(terms.line, f"{called}: {wrong}")
         return None
     return glass
-
-
-def _thermal(block: dict[str, Words]) -> dict[str, Any]:
-    """The fields `thermal`, `celsius` and `expansion` of a glass, from its lines TD and ED."""
-    found: dict[str, Any] = {}
-    if "TD" in block:
-        *thermal, celsius = (block["TD"].number(at, 20.0 if at == 6 else 0.0) for at in range(7))
-        found = {"thermal": tuple(thermal) if any(thermal) else (), "celsius": celsius}
-    expansion = block["ED"].number(0, 0.0) if "ED" in block else 0.0
-    return found | {"expansion": expansion if expansion > 0 else None}

@@ -10,7 +10,7 @@ from ..lens.forms import FORMS
 from ..lens.polygon import CORNERS, convex_pieces, tidied
 from .entry import Entry, array
 
-_KINDS = ("circle", "ellipse", "rectangle", "polygon")
+KINDS = ("circle", "ellipse", "rectangle", "polygon")
 _MOST = 6  # obscurations per lens: n of them need 2^n times as many rays
 _TERMS = 64  # and with polygons of several convex pieces: as many times as many rays
 _MANY = 20  # apertures per surface
@@ -46,9 +46,9 @@ def _read(surface: Entry, key: str) -> list[_Aperture]:
         surface.require(len(given) <= _MANY, key, f"{len(given)} are more than {_MANY}")
     found = []
     for i, values in enumerate(given if many else [given]):
-        entry = Entry(values, surface.name(key) + f"[{i}]" * many, (*_KINDS, "centre"))
-        kinds = [kind for kind in _KINDS if kind in entry]
-        entry.require(len(kinds) == 1, "", f"give one of {', '.join(_KINDS)}")
+        entry = Entry(values, surface.name(key) + f"[{i}]" * many, (*KINDS, "centre"))
+        kinds = [kind for kind in KINDS if kind in entry]
+        entry.require(len(kinds) == 1, "", f"give one of {', '.join(KINDS)}")
         (kind,) = kinds
         centre = entry.vector("centre", 2)
         if kind == "polygon":

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from ..lens.glass import Glass
+from ..lens.glass import FRAUNHOFER, NORMAL_LINE, Glass
 from ..lens.glasses import find_glass, glass_makers, spellings
 from .record import Row, short
 
@@ -24,8 +24,6 @@ _SHORT_CODE = re.compile(r"\d{6}")
 _PAIR = re.compile(r"(\d\.\d{1,17}):(\d{2,3}(?:\.\d{1,17})?)")
 _NIKON = {"NIKON": "HIKARI"}
 _POWERS = np.array([0.0, -1.0, -3.5])
-_LINES = (0.5875618, 0.4861327, 0.6562725, 0.4358343)
-_NORMAL = 0.6438, -0.001682
 _ROUNDING = 1e-12  # a P_gF that is as near to the normal line lies on it
 _M1 = np.array([-7.12849, 4.95284, -0.202244])
 _M2 = np.array([8.84931, -6.91677, 0.454415])
@@ -105,25 +103,26 @@ def written_names(names: Sequence[str]) -> tuple[list[str], dict[str, str]]:
 def to_ours(nd: float, vd: float, above: float) -> tuple[float, float, float]:
     """nd, vd and partial of our model glass from nd, vd and dP of a file."""
     mean = (nd - 1) / vd
-    terms = mean * (_M1 + (_NORMAL[0] + _NORMAL[1] * vd + above) * _M2)
+    terms = mean * (_M1 + (NORMAL_LINE[0] + NORMAL_LINE[1] * vd + above) * _M2)
     terms[0] += nd
-    d, f, c, g = (np.array(_LINES)[:, None] ** _POWERS) @ terms
+    d, f, c, g = (np.array(FRAUNHOFER)[:, None] ** _POWERS) @ terms
     abbe = (d - 1) / (f - c)
-    partial = float((g - f) / (f - c) - _NORMAL[0] - _NORMAL[1] * abbe)
+    partial = float((g - f) / (f - c) - NORMAL_LINE[0] - NORMAL_LINE[1] * abbe)
     return float(d), float(abbe), partial if abs(partial) > _ROUNDING else 0.0
 
 
 def to_theirs(nd: float, vd: float, above: float) -> tuple[float, float, float]:
     """nd, vd and dP of a file from nd, vd and partial of our model glass."""
-    lines = np.array(_LINES)[:, None] ** _POWERS
+    lines = np.array(FRAUNHOFER)[:, None] ** _POWERS
     mean = (nd - 1) / vd
-    wanted = np.array([nd - 1, mean, (_NORMAL[0] + _NORMAL[1] * vd + above) * mean])
+    wanted = np.array([nd - 1, mean, (NORMAL_LINE[0] + NORMAL_LINE[1] * vd + above) * mean])
     ours = np.stack([lines[0], lines[1] - lines[2], lines[3] - lines[1]])
     terms = np.linalg.solve(ours, wanted)
     own = np.stack([np.array([1.0, 0, 0]), _M1, _M2], axis=1)
     index, mean, part = np.linalg.solve(own, terms)
     abbe = index / mean
-    return float(1 + index), float(abbe), float(part / mean - _NORMAL[0] - _NORMAL[1] * abbe)
+    partial = float(part / mean - NORMAL_LINE[0] - NORMAL_LINE[1] * abbe)
+    return float(1 + index), float(abbe), partial
 
 
 def model_keys(row: Row, line: int, nd: float, vd: float, above: float) -> dict[str, Any]:

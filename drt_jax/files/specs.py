@@ -25,10 +25,10 @@ from ..lens.paraxial import (
     paraxial_system,
 )
 from ..lens.phase import Phase
+from ..lens.scene import D_LINE
 from .apertures import apertures_of, semi_diameter
 from .entry import STEEP, WIDE, Entry, LensError, array, require, table
 
-_D_LINE = 0.5875618  # um
 SURFACES = 5000  # surfaces
 _ELEMENTS = 500
 _DENSEST = 10  # index
@@ -295,7 +295,7 @@ def build_lens(values: object, name: str = "lens") -> Lens:
 def middle_of(lens: Lens) -> float:
     """The d line or, if the glasses of a lens exclude it, the middle of their range, um."""
     low, high = lens.dispersion.range
-    return _D_LINE if low <= _D_LINE <= high else (low + high) / 2
+    return D_LINE if low <= D_LINE <= high else (low + high) / 2
 
 
 def _check_focal_length(lens: Lens, stated: float, wavelength: float) -> None:

@@ -11,6 +11,7 @@ import yaml
 from ..inputs import warn
 from ..lens.glass import FRAUNHOFER
 from ..lens.lens import Lens
+from .apertures import KINDS
 from .entry import LensError, require
 from .load import System, known_ending, lens_in, system_for
 from .write_seq import seq_text
@@ -19,7 +20,6 @@ from .written import element_of, entry_of, media_of_lens, place_of, shapes_of
 
 # How far the index of a private glass may be off at more wavelengths than it can be made for.
 _PRIVATE = 1e-6
-_KINDS = ("circle", "ellipse", "rectangle", "polygon")
 _WEIGHTED = ("heights", "field_weights", "vignetting", "wavelengths", "wavelength_weights")
 _CLOSE = 1e-9  # relative, and in mm, of what is read back; rounding of float32 is larger
 
@@ -182,7 +182,7 @@ def _numbers(lens: Lens, waves: list[float], spaced: bool) -> dict[str, np.ndarr
         if form == "asphere":  # as an odd one
             coefficients[i, ::2], coefficients[i, 1::2] = 0, given[i]
     listed = sorted(
-        [i, blocks, _KINDS.index(kind), *centre, *size]
+        [i, blocks, KINDS.index(kind), *centre, *size]
         for i in range(lens.count)
         for blocks, kind, size, centre in shapes_of(lens, i)
     )

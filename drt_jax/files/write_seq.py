@@ -1,6 +1,5 @@
 """Write a lens as a CODE V `.seq` file, the inverse of `seq`."""
 
-import bisect
 import math
 import textwrap
 from collections.abc import Iterable, Mapping, Sequence
@@ -62,10 +61,9 @@ def seq_text(systems: Sequence[System]) -> str:
 def _zooms(texts: Sequence[Sequence[str]]) -> list[str]:
     """The commands of what differs between zoom positions, of the lines of each."""
     found = [f"ZOO {len(texts)}"] if len(texts) > 1 else []
-    starts = [n for n, line in enumerate(texts[0]) if line.startswith("S")]
-    for n, words, at, values in differing(texts):
-        surface, key = bisect.bisect_right(starts, n) - 1, words[0]
-        place = "SI" if surface == len(starts) - 1 else f"S{surface}"
+    last = sum(line.startswith("S") for line in texts[0]) - 1
+    for surface, words, at, values in differing(texts, "S"):
+        key, place = words[0], "SI" if surface == last else f"S{surface}"
         if key in ("S", "SO", "SI") and at in (1, 2):
             command = f"{'CUY' if at == 1 else 'THI'} {place}"
         elif surface >= 0 and len(words) == 2 and at == 1:

@@ -188,18 +188,23 @@ def media_of_lens(lens: Lens) -> tuple[list[dict[str, Any]], dict[str, Any]]:
 
 
 def differing(
-    texts: Sequence[Sequence[str]],
+    texts: Sequence[Sequence[str]], begins: str
 ) -> Iterator[tuple[int, list[str], int, list[str]]]:
     """The words that differ between the lines of C configurations of one lens, without its name:
-    number of the line, its words in the first configuration, number of the word, the C words.
-    LensError if the lines themselves are others."""
+    number of the surface, -1 in front of the first; words of the line in the first configuration;
+    number of the word; the C words. LensError if the lines themselves are others.
+
+    begins: the beginning of the first line of each surface.
+    """
     what = "configurations differ in more than numbers: other glasses, forms, fields or apertures"
     require(len({*map(len, texts)}) == 1, what)
-    for n, lines in enumerate(zip(*texts, strict=True)):
+    surface = -1
+    for lines in zip(*texts, strict=True):
+        surface += lines[0].startswith(begins)
         words = [line.split() for line in lines]
         if words[0][0] in ("NAME", "TITLE"):
             continue
         require(len({*map(len, words)}) == 1, f"{what}: {lines[0].strip()[:80]}")
         for at, values in enumerate(zip(*words, strict=True)):
             if len({*values}) > 1:
-                yield n, words[0], at, [*values]
+                yield surface, words[0], at, [*values]

@@ -4,7 +4,6 @@ The surfaces and the header have the numbers of the current configuration. The r
 are written over them before they are read.
 """
 
-import bisect
 from collections.abc import Sequence
 
 from .entry import LensError
@@ -94,10 +93,9 @@ def rows(texts: Sequence[Sequence[str]]) -> list[str]:
     that differ and that no row changes."""
     of_surface, of_field = ({own: row for row, own in t.items()} for t in (_SURFACE, _FIELD))
     of_wave = {place: row for row, place in _WAVE.items()}
-    starts = [n for n, line in enumerate(texts[0]) if line.startswith("SURF")]
     found = [f"MNUM {len(texts)} 1"]
-    for n, words, at, values in differing(texts):
-        surface, key = bisect.bisect_right(starts, n) - 1, words[0]
+    for surface, words, at, values in differing(texts, "SURF"):
+        key = words[0]
         if surface >= 0 and at == 1 and key in of_surface:
             operand = f"{of_surface[key]} {surface}"
         elif key in of_field:

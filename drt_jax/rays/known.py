@@ -53,16 +53,11 @@ class Known:
 SEARCH = Known()
 
 
-def _given(lens: Lens, scene: Scene, points: Vector) -> tuple[Vector, None]:
-    """Stop points without a plan."""
-    return points, None
-
-
 def known_rays(
     lens: Lens,
     scene: Scene,
     sampling: Any,
-    aim: Callable[[Lens, Scene, Any], tuple[Vector, Any]] = _given,
+    aim: Callable[[Lens, Scene, Any], tuple[Vector, Any]] | None = None,
 ) -> Known:
     """Rays of all points of a scene; nothing inside of `jax.jit` and `jax.vmap`, and for more than
     1024 rays.
@@ -77,7 +72,7 @@ def known_rays(
     lens, scene, sampling = known
     each = []
     for point in scene.each() if scene.shape else [scene]:
-        points, plan = aim(lens, point, sampling)
+        points, plan = aim(lens, point, sampling) if aim else (sampling, None)
         each.append(Known(_found(lens, point, points), plan))
     return jax.tree.map(lambda *a: np.stack(a), *each) if scene.shape else each[0]
 

@@ -11,7 +11,7 @@ from matplotlib.patches import Circle
 
 from ..image.chief import Distortion
 from ..image.fans import AxialColour
-from .analyses import coloured
+from .analyses import coloured, contrast
 from .figures import FIELD_COLOURS
 
 
@@ -44,15 +44,13 @@ def mtf_through_focus(
 ) -> Axes:
     """MTF (F, Z, 2) of fields at one frequency, cycles/mm, over the shift (Z,) of the sensor, mm:
     solid lines are tangential, dashed sagittal."""
-    for both, name, hue in zip(np.asarray(curves), names, itertools.cycle(FIELD_COLOURS)):
-        axes.plot(focus, both[:, 0], color=hue, label=name)
-        axes.plot(focus, both[:, 1], "--", color=hue)
+    styles = zip(names, itertools.cycle(FIELD_COLOURS))
+    contrast(axes, focus, np.asarray(curves).swapaxes(1, 2), styles)
     axes.axvline(0, color="0.7", linewidth=0.6, zorder=0)
-    axes.set(ylim=(0, 1.02), xlim=(np.min(np.asarray(focus)), np.max(np.asarray(focus))))
+    axes.set_xlim(np.min(np.asarray(focus)), np.max(np.asarray(focus)))
     axes.locator_params(axis="x", nbins=5)
     axes.set_xlabel("shift of the sensor (mm); T solid, S dashed")
     axes.set_ylabel(f"MTF at {frequency:.4g} cycles/mm")
-    axes.legend(fontsize=6, frameon=False)
     return axes
 
 

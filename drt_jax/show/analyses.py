@@ -6,7 +6,7 @@ fields (F,) are angles in radians. Values that are not finite are left out.
 
 import itertools
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
@@ -156,13 +156,21 @@ def mtf(
     """MTF (F, 2, N) over frequencies (N,) in cycles/mm, with the diffraction limit (N,): solid
     lines are tangential, dashed sagittal. hues: colours of the fields."""
     axes.plot(frequencies, limit, ":", color="black", label="limit")
-    for both, name, hue in zip(np.asarray(curves), names, itertools.cycle(hues)):
-        axes.plot(frequencies, both[0], color=hue, label=name)
-        axes.plot(frequencies, both[1], "--", color=hue)
-    axes.set(xlim=(0, np.max(np.asarray(frequencies))), ylim=(0, 1.02))
-    axes.set(xlabel="spatial frequency (cycles/mm)", ylabel="MTF, T solid, S dashed")
-    axes.legend(fontsize=6, frameon=False)
+    contrast(axes, frequencies, np.asarray(curves), zip(names, itertools.cycle(hues)))
+    axes.set(xlim=(0, np.max(np.asarray(frequencies))), xlabel="spatial frequency (cycles/mm)")
     return axes
+
+
+def contrast(
+    axes: Axes, places: ArrayLike, curves: np.ndarray, styles: Iterable[tuple[str, str]]
+) -> None:
+    """MTF (F, 2, N) over places (N,): solid lines are tangential, dashed sagittal. styles: label
+    and colour of each of the F pairs of curves."""
+    for (tangential, sagittal), (label, hue) in zip(curves, styles):
+        axes.plot(places, tangential, color=hue, label=label)
+        axes.plot(places, sagittal, "--", color=hue)
+    axes.set(ylim=(0, 1.02), ylabel="MTF, T solid, S dashed")
+    axes.legend(fontsize=6, frameon=False)
 
 
 def mtf_over_field(
@@ -170,14 +178,10 @@ def mtf_over_field(
 ) -> Axes:
     """MTF (F, 2, N) over the field at N frequencies in cycles/mm, black to grey: solid lines are
     tangential, dashed sagittal."""
-    for k, frequency in enumerate(frequencies):
-        grey = str(0.6 * k / max(len(frequencies) - 1, 1))
-        label = f"{frequency:.4g} cycles/mm"
-        for line, style, name in zip(np.asarray(curves)[:, :, k].T, ("-", "--"), (label, None)):
-            axes.plot(_degrees(fields), line, style, color=grey, label=name)
-    axes.set(xlim=_range(fields), ylim=(0, 1.02))
-    axes.set(xlabel="field (degrees)", ylabel="MTF, T solid, S dashed")
-    axes.legend(fontsize=6, frameon=False)
+    most = max(len(frequencies) - 1, 1)
+    styles = [(f"{line:.4g} cycles/mm", str(0.6 * k / most)) for k, line in enumerate(frequencies)]
+    contrast(axes, _degrees(fields), np.asarray(curves).T, styles)
+    axes.set(xlim=_range(fields), xlabel="field (degrees)")
     return axes
 
 
