@@ -19,8 +19,6 @@ from .files.write import save_lens
 from .lens.lens import Lens
 from .show import command as show, glasses
 
-_OTHERS = (".zmx", ".seq")
-
 
 def _options(argv: list[str] | None) -> argparse.Namespace:
     """The parsed command line."""
@@ -73,7 +71,8 @@ def _show_task(what: str) -> None:
 
 def converted(options: argparse.Namespace) -> Iterator[str]:
     """Writes a lens in another format. Warnings say which data the new file leaves out."""
-    read, write = (pathlib.Path(p).suffix.lower() in _OTHERS for p in (options.lens, options.out))
+    paths = options.lens, options.out
+    read, write = (pathlib.Path(path).suffix.lower() in show.OTHERS for path in paths)
     load, given = load_system if read else load_lens, (options.lens, options.missing)
     whole = read and write and options.configuration is None  # with all configurations
     first = load(*given, 1 if whole else options.configuration)

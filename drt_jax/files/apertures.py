@@ -85,8 +85,7 @@ def semi_diameter(surface: Entry) -> float:
     semi = surface.positive("semi_diameter", math.inf, finite=False)
     if math.isinf(semi) and surface.flag("stop"):
         semi = min((own.reach for own in _read(surface, "aperture")), default=math.inf)
-        what = "the stop needs one, or an aperture"
-        surface.require(math.isfinite(semi), "semi_diameter", what)
+        surface.require(math.isfinite(semi), "semi_diameter", "the stop needs one, or an aperture")
     if math.isfinite(semi):
         _check_reach(surface, surface, "semi_diameter", semi)
     return semi

@@ -136,5 +136,4 @@ def model_keys(row: Row, line: int, nd: float, vd: float, above: float) -> dict[
 
 def require_glass(row: Row, line: int, nd: float, vd: float) -> None:
     """LensError for nd and vd that no glass has."""
-    known = 1 < nd <= 4 and 10 <= vd <= 120
-    row.require(known, f"no glass has nd {nd:g} and vd {vd:g}", line)
+    row.require(1 < nd <= 4 and 10 <= vd <= 120, f"no glass has nd {nd:g} and vd {vd:g}", line)

@@ -320,8 +320,7 @@ def _opened(record: Record, lens: Lens) -> Lens:
         wide = focal * value
     elif kind == "object cone angle":  # in degrees
         what = f"an object cone of {value:g} degrees from the axis"
-        what = f"{what}: light that starts backwards is not traced"
-        record.require(value < 90, use.line, what)
+        record.require(value < 90, use.line, f"{what}: light that starts backwards is not traced")
         record.require(math.isfinite(far), use.line, "an object cone of an object at infinity")
         wide = abs(math.tan(math.radians(value)) * (far + place))
     else:  # an NA; that of the object is that of the image times the magnification

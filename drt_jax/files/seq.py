@@ -165,8 +165,7 @@ def _take(reader: _Reader, command: Command) -> None:
             reader.stop = reader.at(command, named[0]) if named else len(reader.surfaces) - 1
         case "RET":
             own = [first for letter, first, _ in command.qualifiers if letter == "S"]
-            what = "RET: expected the surface to return to, as RET S2"
-            command.require(1 <= len(own) <= 2, what)
+            command.require(1 <= len(own) <= 2, "RET: expected the surface to return to, as RET S2")
             moved = reader.at(command, own[0]) if len(own) == 2 else len(reader.surfaces) - 1
             command.require(reader.surfaces, "RET before any surface")
             move(reader.surfaces[moved], command)
@@ -323,8 +322,7 @@ class _Frames:
         """The break from the axis here to the axis of an earlier surface."""
         require, target, line = self.record.require, surface.target, surface.move_line
         require(not surface.moved, line, "RET with a decentre or tilt of its own")
-        known = 1 <= target <= len(self.before)
-        require(known, line, f"RET: surface {target} is not before it")
+        require(1 <= target <= len(self.before), line, f"RET: surface {target} is not before it")
         point, turn, moved = self.before[target - 1]
         what = f"RET: surface {target} is moved itself; return to one that is not"
         require(not moved, line, what)

@@ -86,8 +86,7 @@ class Surface(Row):
             own = {"curvature_x": across / unit, "conic_x": self.value("KX")}
             self.shape("biconic", self.powers(RADIAL), **own)
             return
-        known = across in (0.0, self.curvature)
-        self.require(known, f"a curvature in x on kind {kind}", line)
+        self.require(across in (0.0, self.curvature), f"a curvature in x on kind {kind}", line)
         if kind == "ASP":
             self.shape("asphere", self.powers(LETTERS))
         elif kind == "SPS":
@@ -158,12 +157,10 @@ class Surface(Row):
         for kind in dict.fromkeys(_SHAPES[key] for key in sizes if key in _SHAPES):
             keys = SIZES[kind]
             line = next(own for key, (own, _) in sizes.items() if key in keys)
-            given = all(key in value for key in keys)
-            self.require(given, f"give both {' and '.join(keys)}", line)
+            self.require(all(key in value for key in keys), f"give both {' and '.join(keys)}", line)
             half = [value[key] for key in keys]
             if kind != "circle" and turn not in (0, 90):
-                what = f"{self.name}: an aperture turned by {turn:g} degrees"
-                self.record.lacks(line, what)
+                self.record.lacks(line, f"{self.name}: an aperture turned by {turn:g} degrees")
                 continue
             half = half[::-1] if (turn == 90) != turned else half
             shape: dict[str, Any] = {kind: half[0] if kind == "circle" else half}
@@ -279,8 +276,7 @@ def _diffract(surface: Surface, command: Command) -> None:
     if key in ("DIF", "HCT"):
         surface.phase[key] = line, short(words[0]).upper() if words else ""
         return
-    numbered = (number is None) != (key == "HCO")
-    command.require(numbered, "HCO: expected HCO C1 and a number")
+    command.require((number is None) != (key == "HCO"), "HCO: expected HCO C1 and a number")
     if number:
         key = f"C{number[0]}"
         known = number[0].isdecimal() and 1 <= int(number[0]) <= 100
@@ -294,8 +290,7 @@ def move(surface: Surface, command: Command) -> None:
     if command.key in MOVES:
         surface.moves[command.key] = command.bounded()
         return
-    known = surface.turn in ("", command.key)
-    command.require(known, f"both {surface.turn} and {command.key}")
+    command.require(surface.turn in ("", command.key), f"both {surface.turn} and {command.key}")
     surface.turn = command.key
 
 

@@ -183,8 +183,7 @@ def _medium(entry: Entry, own: dict[str, Glass]) -> Glass:
     entry.require("partial" not in entry, "partial", what)
     if "index" in entry:
         value = entry.number("index")
-        what = f"{value:g} is not between 1 and {_DENSEST}"
-        entry.require(1 <= value <= _DENSEST, "index", what)
+        entry.require(1 <= value <= _DENSEST, "index", f"{value:g} is not between 1 and {_DENSEST}")
         if value == 1:  # the same medium as air: a surface between the two refracts nothing
             return find_glass("air")
         return Glass(f"index {value!r}", schott=(value**2, 0.0, 0.0, 0.0, 0.0, 0.0))

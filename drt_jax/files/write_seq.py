@@ -82,8 +82,7 @@ def _zooms(texts: Sequence[Sequence[str]]) -> list[str]:
 def _lines(system: System) -> list[str]:
     """The lines of one zoom position before GO."""
     lens, worst = system.lens, 0.0
-    what = ".seq files hold no afocal image space here: save as .yaml or .zmx"
-    require(not lens.afocal, what)
+    require(not lens.afocal, ".seq files hold no afocal image space here: save as .yaml or .zmx")
     media, own = media_of_lens(lens)
     for i, keys in enumerate(media):
         made, off = _made(keys, system.wavelengths)

@@ -113,8 +113,7 @@ class Head:
         known = 0 <= kind < len(get_args(FieldKind))
         words.require(known, f"fields of kind {kind}; give angles or heights")
         if telecentric:
-            what = "telecentric object space: all rays go through the stop here"
-            record.lacks(words.line, what)
+            record.lacks(words.line, "telecentric object space: all rays go through the stop here")
         record.use.field_kind, record.use.field_line = get_args(FieldKind)[kind], words.line
         if len(words.values) > 2:
             fields, waves = words.count(2), words.count(3, 1)
@@ -206,10 +205,8 @@ def _finish(record: Record, head: Head, surfaces: list[Surface], whole: bool) ->
     """Do the checks and conversions that need all lines."""
     first, last = surfaces[0], surfaces[-1]
     ends = len(surfaces) > 2 and not last.gap
-    what = "the last SURF is no image: is the file cut short?"
-    record.require(ends, last.line, what)
-    what = "SURF without DISZ: is the file cut short?"
-    record.require(last.gap is not None, last.line, what)
+    record.require(ends, last.line, "the last SURF is no image: is the file cut short?")
+    record.require(last.gap is not None, last.line, "SURF without DISZ: is the file cut short?")
     if not whole:
         record.notes.append("no MNUM behind the surfaces: is the file cut short?")
     record.note_unread("keywords")
@@ -223,8 +220,7 @@ def _finish(record: Record, head: Head, surfaces: list[Surface], whole: bool) ->
         stops[0].put("stop", True)
         record.notes.append(f"no STOP: the stop is {stops[0].name}")
     inside = len(stops) == 1 and stops[0] is not first and stops[0] is not last
-    what = f"{len(stops)} surfaces have STOP; exactly one in the lens must"
-    record.require(inside, 0, what)
+    record.require(inside, 0, f"{len(stops)} surfaces have STOP; exactly one in the lens must")
     record.distance, entry = distance_of(first.gap), first.entry
     record.medium = {key: entry[key] for key in entry if key in MEDIUM_KEYS}
     for surface in surfaces[1:]:

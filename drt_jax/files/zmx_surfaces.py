@@ -203,8 +203,7 @@ class Surface(Row):
         on, the file holds the number of values, the radius and the values; others are ignored."""
         count, radius = self.value(first), self.value(first + 1) * self.unit
         line = self.values.get(first, (self.line, 0))[0]
-        known = count % 1 == 0 and 0 <= count <= 300
-        self.require(known, f"{count:g} terms; give 0 to 300", line)
+        self.require(count % 1 == 0 and 0 <= count <= 300, f"{count:g} terms; give 0 to 300", line)
         found = [self.value(first + 2 + k) for k in range(int(count))]
         known = 1e-6 <= radius <= 1e6 or not any(found)
         self.require(known, f"a norm radius of {radius:g} mm", line)

@@ -91,7 +91,7 @@ class Beam:
         curvature = safe_divide(self.curvature, 1 + farther * self.curvature)
         return dataclasses.replace(self, hits=hits, path=path, curvature=curvature)
 
-    def each(self, function: Callable[["Beam"], Any], focus: Array | None = None) -> Any:
+    def map(self, function: Callable[["Beam"], Any], focus: Array | None = None) -> Any:
         """A function of one beam, of each of the beams (...) that these arrays hold.
 
         focus: mm by which the sensor is moved back, (); or (Z,), an axis of results behind theirs.

@@ -74,7 +74,7 @@ def _encircled(
 
     asked: wavelengths (W,), radii (N,) and spectrum (W,).
     """
-    return beams.each(lambda beam: encircled(lens, beam, *asked, model, cells), focus)
+    return beams.map(lambda beam: encircled(lens, beam, *asked, model, cells), focus)
 
 
 def encircled(
@@ -178,7 +178,7 @@ def _bessel(z: Array) -> Array:
 @functools.partial(jit, wanted=LARGE)
 def _cells(lens: Lens, beams: Beam, asked: tuple[Array, Array, Array], focus: Array) -> Array:
     """Number of cells, (), for which all spots and circles fit into one period of the pattern."""
-    return jnp.max(beams.each(lambda beam: cells_needed(beam, *asked[:2]), focus))
+    return jnp.max(beams.map(lambda beam: cells_needed(beam, *asked[:2]), focus))
 
 
 def cells_needed(beam: Beam, wavelengths: Array, radii: Array) -> Array:

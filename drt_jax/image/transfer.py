@@ -164,7 +164,7 @@ def strehl(lens: Lens, scene: Scene, sampling: float | PupilRule | Sampling | No
 @functools.partial(jit, wanted=LARGE, static_argnames="cells")
 def _strehl(lens: Lens, beams: Beam, wavelengths: Array, cells: int) -> Array:
     """`strehl` of beams (...), for a number of cells."""
-    return beams.each(lambda beam: strehl_of(lens, beam, wavelengths, cells))
+    return beams.map(lambda beam: strehl_of(lens, beam, wavelengths, cells))
 
 
 def strehl_of(lens: Lens, beam: Beam, wavelengths: Array, cells: int) -> Array:
@@ -197,7 +197,7 @@ def _transfer(
 
     asked: wavelengths (W,), frequencies (N,) and spectrum (W,).
     """
-    return beams.each(lambda beam: transfer_of(lens, beam, *asked, model, cells), focus)
+    return beams.map(lambda beam: transfer_of(lens, beam, *asked, model, cells), focus)
 
 
 def centre_of(beam: Beam, spectrum: Array) -> tuple[Array, Array]:

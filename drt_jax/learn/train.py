@@ -41,8 +41,7 @@ class Camera:
         side, pixel = self.kernel, self.pixel_um
         is_odd = 1 <= side <= 999 and side % 2 == 1
         require(is_odd, f"camera.kernel: expected an odd number of pixels, 1 to 999, got {side}")
-        in_range = 1e-3 <= pixel <= 1e4
-        require(in_range, f"camera.pixel_um: expected 1e-3 to 1e4, got {pixel}")
+        require(1e-3 <= pixel <= 1e4, f"camera.pixel_um: expected 1e-3 to 1e4, got {pixel}")
 
 
 def make_imager(

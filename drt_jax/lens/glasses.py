@@ -75,8 +75,7 @@ def _table() -> dict[str, list[_Entry]]:
             celsius=float(celsius or 20),
             status=status,
         )
-        entry = _Entry(plain, glass)
-        entries.insert(0 if plain else len(entries), entry)
+        entries.insert(0 if plain else len(entries), _Entry(plain, glass))
     for name, entries in table.items():
         differ = len({(g.sellmeier, g.schott, g.range) for _, g in entries}) > 1
         for k, (plain, glass) in enumerate(entries):
@@ -96,8 +95,7 @@ def glass_makers() -> tuple[str, ...]:
 def _known_maker(maker: str, what: str = "") -> str:
     """A maker in capitals. ValueError, whose message begins with `what`, for an unknown one."""
     makers = glass_makers()
-    message = f"{what}unknown maker {maker!r}; makers: {', '.join(makers)}"
-    require(maker.upper() in makers, message)
+    require(maker.upper() in makers, f"{what}unknown maker {maker!r}; makers: {', '.join(makers)}")
     return maker.upper()
 
 

@@ -35,7 +35,7 @@ from .sheet import panels, sheet
 _LINES = (0.6562725, 0.5875618, 0.4861327)  # C, d, F
 # Orders of the two rules for the spots; a larger relative difference of spot size is reported.
 _ORDERS, _TOLERANCE = (14, 20), 1e-3
-_OTHERS = (".zmx", ".seq")
+OTHERS = (".zmx", ".seq")
 _DEFOCUS = 3.0  # a spot larger than this many times the smallest spot is out of focus
 _WAVES = 5  # of more wavelengths of a file, the primary, longest and shortest are shown
 MISSING = "warn: leave out what the package has not and rays can go on without, and say so"
@@ -120,7 +120,7 @@ def told(options: argparse.Namespace, say: Callable[[str], None]) -> Iterator[Li
 def _all_told(options: argparse.Namespace) -> Iterator[Line]:
     """A table of all configurations of a file, which are drawn under each other."""
     path = pathlib.Path(options.lens)
-    several = path.suffix.lower() in _OTHERS
+    several = path.suffix.lower() in OTHERS
     require(several, f"--configuration all: {path.name} has one; expected a .zmx or .seq file")
     count = load_system(path, options.missing, 1).configurations
     each = [vars(options) | {"configuration": k} for k in range(1, count + 1)]
@@ -171,7 +171,7 @@ def view_of(options: argparse.Namespace) -> View:
     """What the options and a file ask for. Options override the values of a .zmx or .seq file."""
     fields, distance, waves, note = [0.0, 7.0, 10.0], math.inf, list(_LINES), ""
     weights = {wave: 1.0 for wave in waves}
-    if pathlib.Path(options.lens).suffix.lower() in _OTHERS:
+    if pathlib.Path(options.lens).suffix.lower() in OTHERS:
         system = load_system(options.lens, options.missing, options.configuration)
         lens, distance = system.lens, system.distance
         primary = float(system.wavelengths[system.primary])

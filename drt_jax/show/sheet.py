@@ -231,7 +231,11 @@ def analysed(
     beams = beams_of(lens, at(wide), beam_rule(_DEGREE, rule.symmetry, rule))
     asked = scene.wavelengths, scene.spectrum, jnp.asarray(lines), radii
     contrast, best, over, energy = _waves(lens, beams, asked, len(some), model, cells)
-    third = _third(lens, at([widest]))
+    third: ThirdOrder | str
+    try:
+        third = jax.tree.map(lambda a: np.asarray(a[0]), _third_order(lens, at([widest])))
+    except ValueError as error:  # no theory for such a lens
+        third = str(error)
     traced = shown, left_out, line, foci, bent, colour, fans, spots, hits
     curves = lines, contrast, best, over, radii, energy, model
     return Results(lens, *traced, *curves, third)
@@ -248,14 +252,6 @@ def shown_fields(lens: Lens, scene: Scene) -> tuple[Scene, list[float]]:
     picked = np.round(np.linspace(0, len(angles) - 1, count)).astype(int)
     field = np.stack([0 * angles[picked], angles[picked]], axis=-1)
     return checked_scene(lens, scene.at(jnp.asarray(field))), np.delete(angles, picked).tolist()
-
-
-def _third(lens: Lens, scene: Scene) -> ThirdOrder | str:
-    """Third-order aberrations of a scene of one point, or why there are none."""
-    try:
-        return jax.tree.map(lambda a: np.asarray(a[0]), _third_order(lens, scene))
-    except ValueError as error:
-        return str(error)
 
 
 _third_order = jit(third_order, ONCE)
