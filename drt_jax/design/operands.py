@@ -87,10 +87,8 @@ class Operand:
             raise ValueError(f"{what}: target: 0 is no light; give 1 for the best, or limits")
         require(low != high, f"{what}: low and high are both {low:g}; give it as the target")
         require(low < high, f"{what}: low {low:g} is not below high {high:g}; exchange them")
-        if not 0 <= self.weight < math.inf:
-            raise ValueError(
-                f"{what}: weight: must be above 0, or 0 to leave it out, got {self.weight:g}"
-            )
+        size = f"must be above 0, or 0 to leave it out, got {self.weight:g}"
+        require(0 <= self.weight < math.inf, f"{what}: weight: {size}")
         if not self.vignetting and not (known.of_spots or callable(self.kind)):
             some = ", ".join(kind for kind, value in OPERANDS.items() if value.of_spots)
             raise ValueError(f"{what}: vignetting: is of {some}; leave it out")

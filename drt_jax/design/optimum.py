@@ -175,9 +175,9 @@ def optimise(
     start cannot be evaluated (no ray of a field passes, or a number is not finite), for a limit
     that the start violates and that no variable changes, and inside of `jax.jit`.
     """
+    outside = concrete((problem, vector))
     require(
-        concrete((problem, vector)),
-        "optimise: call it outside of jax.jit; inside, use least_squares.init and step",
+        outside, "optimise: call it outside of jax.jit; inside, use least_squares.init and step"
     )
     start = problem.variables.start if vector is None else jnp.asarray(vector)
     tried, history = problem.with_solver(solve_aimed), list[list[Array]]()

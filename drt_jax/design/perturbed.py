@@ -239,10 +239,8 @@ class Tolerance:
         require_one_of("tolerances: kind", self.kind, KINDS)
         most = KINDS[self.kind].most
         below = "" if math.isinf(most) else f" and below {most:g}"
-        require(
-            0 < self.size < most,
-            f"tolerances: {self.kind}: size: must be above 0{below}, got {self.size:g}",
-        )
+        what = f"tolerances: {self.kind}: size: must be above 0{below}, got {self.size:g}"
+        require(0 < self.size < most, what)
 
 
 class Deviation(NamedTuple):
@@ -303,11 +301,20 @@ class PerturbedLens:
         require(shape == (lens.count,), f"beam_radius: expected ({lens.count},), got shape {shape}")
         sizes: dict[Deviation, float] = {}
         for tolerance in tolerances:
-            for deviation in _deviations_of(lens, tolerance):
-                require(
-                    deviation not in sizes, f"tolerances: {deviation} is named twice; remove one"
-                )
-                sizes[deviation] = tolerance.size
+            kind, which, what = (
+                KINDS[tolerance.kind],
+                tolerance.which,
+                f"tolerances: {tolerance.kind}",
+            )
+            possible = kind.places(lens)
+            require(possible, f"{what}: {kind.why_none}")
+            some = f"no {kind.whole} {{}} can deviate; there are {', '.join(map(str, possible))}"
+            for place in which:
+                require(place in possible, f"{what}: {some.format(place)}")
+            for place, axis in itertools.product(which or possible, range(kind.axes)):
+                one = Deviation(tolerance.kind, place, axis)
+                require(one not in sizes, f"tolerances: {one} is named twice; remove one")
+                sizes[one] = tolerance.size
         require(sizes, "tolerances: none; name at least one")
         spans, dtype = elements_of(lens), lens.curvature.dtype
         lens, groups = _with_parts(lens, spans, sizes)
@@ -341,18 +348,6 @@ class PerturbedLens:
             errors = _Errors(self.lens, self.beam_radius, at, axis, by[own])
             lens = KINDS[kind].change(lens, errors)
         return lens
-
-
-def _deviations_of(lens: Lens, tolerance: Tolerance) -> list[Deviation]:
-    """The deviations that one tolerance allows; see `PerturbedLens.from_lens`."""
-    kind = KINDS[tolerance.kind]
-    possible, what = kind.places(lens), f"tolerances: {tolerance.kind}"
-    require(possible, f"{what}: {kind.why_none}")
-    some = ", ".join(map(str, possible))
-    for place in tolerance.which:
-        require(place in possible, f"{what}: no {kind.whole} {place} can deviate; there are {some}")
-    places = itertools.product(tolerance.which or possible, range(kind.axes))
-    return [Deviation(tolerance.kind, place, axis) for place, axis in places]
 
 
 def _with_parts(

@@ -50,10 +50,8 @@ def _axes(scene: Scene) -> tuple[Array, Array, Array]:
     distance. ValueError for other points."""
     field, far = scene.field, scene.distance
     is_grid = far.ndim == 2 and far.shape[1] == 1 == field.ndim - 1
-    require(
-        not far.ndim or field.ndim == 1 or is_grid,
-        "scene: a problem has every field at every distance: take Scene.grid(fields, distances)",
-    )
+    what = "scene: a problem has every field at every distance: take Scene.grid(fields, distances)"
+    require(not far.ndim or field.ndim == 1 or is_grid, what)
     return field.reshape(-1, 2), far.reshape(-1), scene.wavelengths
 
 
@@ -149,14 +147,11 @@ class Problem:
             what = f"operands: {operand.name}"
             operand.check(self.variables.lens, self._counts)
             named = distances[np.array(operand.distances or range(len(distances)))]
-            require(
-                operand.kind != "magnification" or np.all(np.isfinite(named)),
-                f"{what}: the object is at infinity",
-            )
-            require(
-                operand.vignetting or not isinstance(rule, Clipped),
-                f"{what}: vignetting: Clipped traces only what passes; take Gauss or Soft",
-            )
+            near = operand.kind != "magnification" or np.all(np.isfinite(named))
+            require(near, f"{what}: the object is at infinity")
+            whole = operand.vignetting or not isinstance(rule, Clipped)
+            remedy = "Clipped traces only what passes; take Gauss or Soft"
+            require(whole, f"{what}: vignetting: {remedy}")
             require(
                 not kind_of(operand.kind).of_waves or degree_of(rule) >= 2,
                 f"{what}: rule: needs Gauss or Soft of the order 2 or more, or Clipped of the "

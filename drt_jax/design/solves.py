@@ -81,10 +81,8 @@ class Solve:
         what = f"solves: {self.kind}"
         finite = math.isfinite(self.value)
         require(finite, f"{what}: value: must be finite, got {self.value:g}")
-        require(
-            self.value >= 0 or not self.aperture,
-            f"{what}: value: must be above 0, or 0 for that of the start, got {self.value:g}",
-        )
+        least = f"must be above 0, or 0 for that of the start, got {self.value:g}"
+        require(self.value >= 0 or not self.aperture, f"{what}: value: {least}")
         for name in ("fields", "wavelengths"):
             numbers = tuple(float(number) for number in np.ravel(getattr(self, name)))
             require(numbers, f"{what}: {name}: none; give one or leave it out")
@@ -110,10 +108,8 @@ class Solve:
         if self.aperture:
             return Place("semi_diameter", lens.stop, 0)
         active = ", ".join(map(str, lens.active))
-        require(
-            self.surface in lens.active,
-            f"solves: {self.kind}: its curvature follows: give surface, one of {active}",
-        )
+        what = f"solves: {self.kind}: its curvature follows: give surface, one of {active}"
+        require(self.surface in lens.active, what)
         require(
             self.kind != "image_angle" or self.surface >= lens.stop,
             f"solves: image_angle: surface {self.surface} lies before the stop, which is number "

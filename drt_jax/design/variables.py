@@ -82,40 +82,24 @@ class Vary:
         for name in ("surfaces", "terms"):
             numbers = whole_numbers(f"{what}: {name}", getattr(self, name))
             object.__setattr__(self, name, numbers)
-        require(
-            self.low < self.high,
-            f"{what}: low {self.low:g} is not below high {self.high:g}; exchange them",
-        )
-        require(
-            0 <= self.scale < np.inf,
-            f"{what}: scale: must be above 0, or 0 to have it chosen, got {self.scale:g}",
-        )
-        self._check_sag()
+        order = f"low {self.low:g} is not below high {self.high:g}; exchange them"
+        require(self.low < self.high, f"{what}: {order}")
+        size = f"scale: must be above 0, or 0 to have it chosen, got {self.scale:g}"
+        require(0 <= self.scale < np.inf, f"{what}: {size}")
+        pair, both = (self.sag, self.semi_diameter), "variables: sag and semi_diameter"
+        if pair != (0, 0):
+            series = self.kind in SERIES
+            require(series, f"{both}: are of coefficients, not of {self.kind}; give low and high")
+            given = all(0 < number < np.inf for number in pair)
+            require(given, f"{both}: give both, above 0 mm, got {pair[0]:g} and {pair[1]:g}")
+            free = (self.low, self.high) == (-np.inf, np.inf)
+            require(free, f"{both}: stand instead of low and high; leave these out")
         least, most = PARTS[self.kind].limits
         low, high = max(self.low, least), min(self.high, most)
         between = f"{self.low:g} to {self.high:g} lies outside of {least:g} to {most:g}"
         require(low < high, f"{what}: {between}; widen it")
         object.__setattr__(self, "low", low)
         object.__setattr__(self, "high", high)
-
-    def _check_sag(self) -> None:
-        """Raises ValueError for `sag` and `semi_diameter` that do not fit together or the kind."""
-        pair = self.sag, self.semi_diameter
-        if pair == (0, 0):
-            return
-        what = "variables: sag and semi_diameter"
-        require(
-            self.kind in SERIES,
-            f"{what}: are of coefficients, not of {self.kind}; give low and high",
-        )
-        require(
-            all(0 < number < np.inf for number in pair),
-            f"{what}: give both, above 0 mm, got {pair[0]:g} and {pair[1]:g}",
-        )
-        require(
-            (self.low, self.high) == (-np.inf, np.inf),
-            f"{what}: stand instead of low and high; leave these out",
-        )
 
     def bounds(self, lens: Lens, place: Place) -> tuple[float, float, float]:
         """Low bound, high bound and scale of one variable, in the units of the lens."""
@@ -155,10 +139,8 @@ class Tie:
         require_one_of("ties: kind", self.kind, PARTS)
         numbers = whole_numbers("ties: surfaces", self.surfaces)
         object.__setattr__(self, "surfaces", numbers)
-        require(
-            len(numbers) >= 2 and len(set(numbers)) == len(numbers),
-            f"ties: expected two or more different surfaces, got {numbers}",
-        )
+        several = len(numbers) >= 2 and len(set(numbers)) == len(numbers)
+        require(several, f"ties: expected two or more different surfaces, got {numbers}")
         if self.how == "cemented":
             neighbours = len(numbers) == 2 and abs(numbers[0] - numbers[1]) == 1
             require(neighbours, f"ties: cemented: expected two neighbours, got {numbers}")
@@ -259,18 +241,14 @@ class Variables:
             )
         # If all numbers of a kind vary, tied and solved ones are left out. Naming one is an error.
         for place, v in found:
-            require(
-                not (place in followers and v.surfaces),
-                f"variables: {place} follows from a tie or a solve; leave it out here",
-            )
+            free = not (place in followers and v.surfaces)
+            require(free, f"variables: {place} follows from a tie or a solve; leave it out here")
         found = [(place, v) for place, v in found if place not in followers]
         _refuse_twice("variables", [place for place, _ in found], "stands twice")
         more = "fewer solves or more variables are needed" if solves else "name some"
         require(found, f"variables: none is left; {more}")
-        require(
-            len(solves) <= len(found),
-            f"solves: {len(solves)} of them, but {len(found)} variables; leave some out",
-        )
+        counts = f"{len(solves)} of them, but {len(found)} variables"
+        require(len(solves) <= len(found), f"solves: {counts}; leave some out")
         index = {place: k for k, (place, _) in enumerate(found)}
         # Followers of a number that does not vary are set once, here.
         fixed = [(f, a * number_at(lens, p)[0] + b) for p, f, (a, b) in following if p not in index]
@@ -302,10 +280,8 @@ class Variables:
         if isinstance(sets, Variables):
             return sets
         found = list(sets) if isinstance(sets, Sequence) else [sets]
-        require(
-            found and all(isinstance(own, Variables) for own in found),
-            "variables: expected Variables.from_lens(lens, [...]), or several",
-        )
+        are_sets = found and all(isinstance(own, Variables) for own in found)
+        require(are_sets, "variables: expected Variables.from_lens(lens, [...]), or several")
         cold = all(own.environment is None for own in found)
         require(cold, "variables: join the sets first, then take them at a temperature")
         kinds, lenses = {place.kind for own in found for place in own.places}, []

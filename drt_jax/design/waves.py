@@ -20,7 +20,7 @@ from ..image.kernel import check_pixels
 from ..image.sensor import noise_of
 from ..image.transfer import strehl_of, transfer_of
 from ..image.wiener import wiener
-from ..inputs import shown
+from ..inputs import require, shown
 from ..lens.lens import Lens
 from ..lens.scene import Scene
 from ..numerics import Numbers, safe_sqrt
@@ -112,10 +112,8 @@ def psf(
     Returns a `Psf` with kernels (V, W, size, size). ValueError for a rule whose rays do not
     determine polynomials.
     """
-    if degree_of(rays.rule) < 2:
-        raise ValueError(
-            f"rule: needs Gauss, Soft or Clipped of a higher order; got {shown(rays.rule)}"
-        )
+    what = f"rule: needs Gauss, Soft or Clipped of a higher order; got {shown(rays.rule)}"
+    require(degree_of(rays.rule) >= 2, what)
     waves = rays.wavelengths
     options = waves, check_pixels(pixel, size, waves.dtype), kind, cells
     return _of_beams(lens, rays, lambda beam: psf_of_beam(lens, beam, *options))

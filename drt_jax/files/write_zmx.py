@@ -224,14 +224,6 @@ def _moves(lens: Lens) -> list[dict[str, Any]]:
     return sorted(moves, key=lambda move: (move["surfaces"][0], -move["surfaces"][1]))
 
 
-def _break(move: Mapping[str, Any], back: bool) -> list[str]:
-    """A coordinate break; with `back` its inverse: tilts in reverse order, then the decentre."""
-    numbers = [*move["shift"][:2], *move["tilt"]]
-    values = [0.0 - value for value in numbers] if back else numbers
-    lines = [f"PARM {k} {value!r}" for k, value in enumerate(values, 1) if value]
-    return ["TYPE COORDBRK", "CURV 0.0", *lines, *(["PARM 6 1"] if back else [])]
-
-
 def _with_breaks(
     lens: Lens, surfaces: list[list[str]], gaps: list[float]
 ) -> tuple[list[list[str]], list[float]]:
@@ -250,7 +242,11 @@ def _with_breaks(
             about, along = move["about"], move["shift"][2]
             pivot = {before: 0.0, i: gap}.get(about, axis[about] - axis[before]) + move["pivot"]
             behind.append(pivot - at + (0.0 if back else along))
-            blocks.append(_break(move, back))
+            # With `back` the inverse: tilts in reverse order, then the decentre.
+            numbers = [*move["shift"][:2], *move["tilt"]]
+            values = [0.0 - value for value in numbers] if back else numbers
+            lines = [f"PARM {k} {value!r}" for k, value in enumerate(values, 1) if value]
+            blocks.append(["TYPE COORDBRK", "CURV 0.0", *lines, *(["PARM 6 1"] if back else [])])
             at = pivot + (along if back else 0.0)
         behind.append(gap - at)
         blocks.append(surface)

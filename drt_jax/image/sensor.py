@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
+from ..inputs import require
 from ..numerics import EXACT, Numbers, einsum, safe_sqrt
 from .kernel import SeparableKernel
 
@@ -68,10 +69,8 @@ def _check(scenes: Array, kernel: SeparableKernel | Array) -> None:
             f"scenes: expected (B, H, W, C) with the C of the kernel, got {shape} and "
             f"{[jnp.shape(part) for part in parts]}"
         )
-    if min(shape[1:3]) < max(sizes):
-        raise ValueError(
-            f"scenes: {shape[1]} x {shape[2]} pixels are smaller than the kernel of {max(sizes)}"
-        )
+    what = f"scenes: {shape[1]} x {shape[2]} pixels are smaller than the kernel of {max(sizes)}"
+    require(min(shape[1:3]) >= max(sizes), what)
 
 
 def convolve(scenes: Array, kernel: SeparableKernel | Array) -> Array:

@@ -19,6 +19,7 @@ import numpy as np
 from jax import Array
 
 from ..compilation import LARGE, jit
+from ..inputs import require
 from ..lens.lens import Lens
 from ..lens.paraxial import chief_ray, paraxial_system
 from ..lens.scene import Scene, checked_scene, over_points
@@ -90,12 +91,10 @@ def wavefront(
     kappa = None
     if curvature is not None:
         kappa = real_array("curvature", curvature, lens.curvature.dtype)
-        if kappa.shape not in ((), scene.wavelengths.shape):
-            raise ValueError(
-                f"curvature: expected one or one a wavelength, got shape {kappa.shape}"
-            )
-        if concrete(curvature) and not np.all(np.isfinite(np.asarray(curvature, float))):
-            raise ValueError("curvature: must be finite; 0 for a telecentric exit pupil")
+        fits = kappa.shape in ((), scene.wavelengths.shape)
+        require(fits, f"curvature: expected one or one a wavelength, got shape {kappa.shape}")
+        finite = not concrete(curvature) or np.all(np.isfinite(np.asarray(curvature, float)))
+        require(finite, "curvature: must be finite; 0 for a telecentric exit pupil")
     warn_of_paths(lens, scene)
     points = jnp.concatenate([jnp.zeros_like(points[:1]), points])  # the chief ray first
     return _wavefront(lens, scene, points, kappa, known_rays(lens, scene, points.T))

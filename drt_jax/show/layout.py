@@ -106,7 +106,11 @@ def draw(lens: Lens, scene: Scene | None = None, rays: int = 7) -> Drawing:
     low, high = faces[lens.stop][[0, -1]]
     outwards = (high - low) / np.linalg.norm(high - low) * 0.15 * reach
     blades = [np.stack([low, low - outwards]), np.stack([high, high + outwards])]
-    sensor = _sensor(lens, paths, reach)
+    # The face of the sensor about its centre, as wide as the rays that meet it.
+    centre = _placed(lens, lens.count, np.zeros(1), np.zeros(1))
+    away = [float(np.linalg.norm(path[-1] - centre)) for fan in paths for path in fan]
+    wide = max(1.1 * max(away, default=0.0), 0.3 * reach)
+    sensor = _placed(lens, lens.count, np.array([-wide, wide]), np.zeros(2))
     tops = {i: faces[i][-1, 1] for i in lens.active}
     for pair, outline in zip(_pieces(lens), glass):
         tops |= {i: max(tops[i], np.max(outline[:, 1])) for i in pair}
@@ -388,11 +392,3 @@ def _path(corners: np.ndarray, start: float, angle: float, distance: float) -> n
     slope = (y / distance + np.tan(angle)) / (z / distance + 1)
     step = (z - start) * min(1.0, 2 / math.hypot(1.0, slope))
     return np.concatenate([[[z - step, y - slope * step]], corners])
-
-
-def _sensor(lens: Lens, paths: list[list[np.ndarray]], reach: float) -> np.ndarray:
-    """The face of the sensor about its centre, as wide as the rays that meet it."""
-    middle = _placed(lens, lens.count, np.zeros(1), np.zeros(1))
-    ends = [float(np.linalg.norm(path[-1] - middle)) for fan in paths for path in fan]
-    wide = max(1.1 * max(ends, default=0.0), 0.3 * reach)
-    return _placed(lens, lens.count, np.array([-wide, wide]), np.zeros(2))
