@@ -301,12 +301,8 @@ class PerturbedLens:
         require(shape == (lens.count,), f"beam_radius: expected ({lens.count},), got shape {shape}")
         sizes: dict[Deviation, float] = {}
         for tolerance in tolerances:
-            kind, which, what = (
-                KINDS[tolerance.kind],
-                tolerance.which,
-                f"tolerances: {tolerance.kind}",
-            )
-            possible = kind.places(lens)
+            kind, what = KINDS[tolerance.kind], f"tolerances: {tolerance.kind}"
+            possible, which = kind.places(lens), tolerance.which
             require(possible, f"{what}: {kind.why_none}")
             some = f"no {kind.whole} {{}} can deviate; there are {', '.join(map(str, possible))}"
             for place in which:

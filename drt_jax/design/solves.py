@@ -28,14 +28,9 @@ from .parts import Place, number_at, step_of
 
 # In the order of application. No solve changes the condition of an earlier one, see `fix_solves`.
 _Name = Literal[
-    "focal_length",
-    "effective_focal_length",
-    "entrance_pupil",
-    "f_number",
-    "image_angle",
-    "paraxial_focus",
-    "best_focus",
-]
+    "focal_length", "effective_focal_length", "entrance_pupil", "f_number", "image_angle",
+    "paraxial_focus", "best_focus"
+]  # fmt: skip
 # Number of Newton steps. Every condition is linear in the solved number, so that one step solves
 # it; the second step removes rounding errors.
 _STEPS = 2

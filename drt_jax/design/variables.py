@@ -257,16 +257,10 @@ class Variables:
         rows = np.array([v.bounds(lens, place) for place, v in found])
         low, high = jnp.asarray(rows[:, :2] / rows[:, 2:], dtype).T
         tied = [(index[p], f, line) for p, f, line in following if p in index]
-        variables = cls(
-            lens,
-            low,
-            high,
-            scale=jnp.asarray(rows[:, 2], dtype),
-            solves=(),
-            lines=jnp.asarray([line for *_, line in tied], dtype).reshape(-1, 2),
-            places=tuple(index),
-            ties=tuple((k, f) for k, f, _ in tied),
-        )
+        scale = jnp.asarray(rows[:, 2], dtype)
+        lines = jnp.asarray([line for *_, line in tied], dtype).reshape(-1, 2)
+        places, pairs = tuple(index), tuple((k, f) for k, f, _ in tied)
+        variables = cls(lens, low, high, scale, (), lines, places, pairs)
         fixed_solves, start = fix_solves(variables.lens_of(variables.start), solves)
         return dataclasses.replace(variables, lens=start, solves=fixed_solves)
 

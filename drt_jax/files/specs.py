@@ -336,8 +336,7 @@ def _check_order(lens: Lens, gaps: list[float], moved: list[bool], wave: float) 
             raise LensError(f"{key}{reach}: must be {least}; {remedy}", key)
         sensor = f"sensor: {float(lens.sensor):g} mm"
         vertex = f"the vertex of surface {i} at {float(lens.vertices[i]):g} mm"
-        if gap > -CLOSEST:
-            raise LensError(f"{sensor} touches {vertex}; move it by {CLOSEST} mm", "sensor")
+        require(gap <= -CLOSEST, f"{sensor} touches {vertex}; move it by {CLOSEST} mm", "sensor")
         virtual = "rays are prolonged backwards to a virtual image"
         warn(f"{sensor} lies before {vertex}{turned}: {virtual}")
     semi = np.asarray(lens.semi_diameter)

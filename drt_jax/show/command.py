@@ -179,10 +179,8 @@ def view_of(options: argparse.Namespace) -> View:
         others = sorted({*weights} - {primary}, reverse=True)
         if len(others) >= _WAVES and options.wavelengths is None:
             left = ", ".join(f"{w:.4g}" for w in others[1:-1])
-            note, others = (
-                f"  ! wavelengths of the file left out: {left} um",
-                [others[0], others[-1]],
-            )
+            note = f"  ! wavelengths of the file left out: {left} um"
+            others = [others[0], others[-1]]
         middle = (len(others) + 1) // 2
         waves = [*others[:middle], primary, *others[middle:]]
         angles = system.fields

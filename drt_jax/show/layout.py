@@ -7,7 +7,7 @@ import functools
 import itertools
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -360,14 +360,8 @@ def lens_drawing(axes: Axes, drawing: Drawing, half: bool = False) -> Axes:
         axes.plot(*blade.T, color="black", linewidth=2.5, solid_capstyle="butt", zorder=3)
     axes.plot(*drawing.sensor.T, color="black", linewidth=1.5)
     for number, (z, y) in drawing.numbers:
-        axes.annotate(
-            str(number),
-            (z, y),
-            (0, 2 + 6 * (number % 2)),
-            textcoords="offset points",
-            ha="center",
-            fontsize=6,
-        )
+        style: dict[str, Any] = {"textcoords": "offset points", "ha": "center", "fontsize": 6}
+        axes.annotate(str(number), (z, y), (0, 2 + 6 * (number % 2)), **style)
     axes.set_aspect("equal")
     axes.margins(y=0.1)
     axes.set(xlabel="z from the first vertex (mm)", ylabel="y (mm)")
