@@ -55,7 +55,7 @@ ROOMS = {
     "drt_jax/learn": 655,
     "drt_jax/lens": 1870,
     "drt_jax/pupil": 776,
-    "drt_jax/rays": 1287,
+    "drt_jax/rays": 1312,
     "drt_jax/show": 1437,
     "experiments": 490,
     "experiments/designing": 914,

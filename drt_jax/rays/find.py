@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optimistix as optx
 from jax import Array
 
 from ..numerics import run_if
@@ -52,40 +53,90 @@ class Found(NamedTuple):
     steps: Array
 
 
-def polish(
-    system: System, target: Vector, hits: Vector, active: Array
-) -> tuple[Vector, Array, Array]:
-    """Makes the hits of the `active` rays (W, Q) stationary, by Newton's method with the
-    propagation of `linear` as its solve.
+class _State(NamedTuple):
+    """State of the polish.
 
-    All rays step together. A ray whose correction is not finite keeps its hits. The search ends
-    when all rays are stationary to rounding (see `fermat.stationary`), when two steps in a row move
-    no ray by more than rounding, or after 16 steps.
+    solved: (W, Q), bool, rays that are stationary to rounding.
+    still: (), int32, number of steps in a row that moved no ray.
+    step: (), int32, number of steps so far.
+    """
+
+    solved: Array
+    still: Array
+    step: Array
+
+
+class BlockNewton(optx.AbstractRootFinder):
+    """Newton's method for a bundle of Fermat paths, with the propagation of `linear` as its solve.
+
+    The arguments of the equations are (system, target, mask (W, Q) of the rays that may move). All
+    rays step together. A ray whose correction is not finite keeps its hits. The search ends when
+    all rays are stationary to rounding (see `fermat.stationary`). It ends with
+    RESULTS.nonlinear_divergence when two steps in a row move no ray by more than `atol` + `rtol`
+    times its hits; the state then holds the mask of the solved rays.
+
+    rtol, atol: tolerances on the hits, relative and in mm.
+    norm: norm of a correction.
+    """
+
+    rtol: float
+    atol: float
+    norm: Callable = optx.max_norm
+
+    def init(self, fn, y, args, options, f_struct, aux_struct, tags) -> _State:
+        """The state before the first step; there is no step if no ray may move."""
+        return _State(~args[2], jnp.zeros((), jnp.int32), jnp.zeros((), jnp.int32))
+
+    def step(self, fn, y, args, options, state, tags) -> tuple[Vector, _State, Any]:
+        """One Newton step of every ray that is not stationary yet."""
+        system, target, _ = args
+        (rhs, path), aux = fn(y, args)
+        solved = state.solved | fermat.stationary(path, system, target)
+        change, _ = linear.solve(path, system, ~solved, rhs)
+        finite = jnp.all(jnp.isfinite(dot(change, change)), axis=0)
+        moves = finite & ~solved
+        change = where(moves, change, 0)
+        # Relative to each hit, so that a diverging ray does not hide the corrections of others.
+        scale = self.rtol / self.atol
+        size = self.norm(tuple(c / (1 + scale * abs(a)) for a, c in zip(y, change, strict=True)))
+        y = subtract(y, change)
+        still = jnp.where(size <= self.atol, state.still + 1, 0)
+        return y, _State(solved, still, state.step + 1), aux
+
+    def terminate(self, fn, y, args, options, state, tags) -> tuple[Array, optx.RESULTS]:
+        """True once all rays are stationary or none moves any more, and the result."""
+        done, still = jnp.all(state.solved), state.still > 1
+        results = optx.RESULTS.nonlinear_divergence, optx.RESULTS.successful
+        return done | still, optx.RESULTS.where(still & ~done, *results)
+
+    def postprocess(self, fn, y, aux, args, options, state, tags, result):
+        """Returns the values unchanged."""
+        return y, aux, {}
+
+
+def _polish(system: System, target: Vector, hits: Vector, active: Array) -> tuple:
+    """Makes the hits of the `active` rays (W, Q) stationary, by at most 16 Newton steps.
 
     Returns the hits, the mask of solved rays and the number of steps.
     """
-    least = 2 * float(jnp.finfo(hits[0].dtype).eps)
 
-    def goes_on(state: tuple[Vector, Array, Array, Array]) -> Array:
-        _, solved, still, steps = state
-        return ~jnp.all(solved) & (still < 2) & (steps < _MAX_STEPS)
-
-    def step(state: tuple[Vector, Array, Array, Array]) -> tuple[Vector, Array, Array, Array]:
-        hits, solved, still, steps = state
+    def equations(hits, args):
+        system, target, _ = args
         path = fermat.geometry(hits, system)
-        solved = solved | fermat.stationary(path, system, target)
-        change, _ = linear.solve(path, system, ~solved, linear.shortfall(path, system, target))
-        finite = jnp.all(jnp.isfinite(dot(change, change)), axis=0)
-        change = where(finite & ~solved, change, 0)
-        # Relative to each hit, so that a diverging ray does not hide the corrections of others.
-        sizes = (jnp.max(abs(c) / (1 + abs(a))) for a, c in zip(hits, change, strict=True))
-        still = jnp.where(functools.reduce(jnp.maximum, sizes) <= least, still + 1, 0)
-        return subtract(hits, change), solved, still, steps + 1
+        return (linear.shortfall(path, system, target), path), None
 
-    hits, solved, _, steps = jax.lax.while_loop(
-        goes_on, step, (hits, ~active, jnp.int32(0), jnp.int32(0))
+    eps = float(jnp.finfo(hits[0].dtype).eps)
+    solution: optx.Solution = optx.root_find(
+        equations,
+        BlockNewton(rtol=2 * eps, atol=2 * eps),
+        hits,
+        args=(system, target, active),
+        has_aux=True,
+        max_steps=_MAX_STEPS,
+        throw=False,
     )
-    return hits, solved, steps
+    all_solved = solution.result == optx.RESULTS.successful
+    return solution.value, all_solved | solution.state.solved, solution.stats["num_steps"]
 
 
 def find(
@@ -107,7 +158,7 @@ def find(
     hits, crossing = split_stop(system, search.hits)
     hits = where(ok, hits, 0)
     rough = ok & ~fermat.met(crossing, target, hits, system)
-    hits, solved, steps = polish(system, target, hits, rough)
+    hits, solved, steps = _polish(system, target, hits, rough)
     status = jnp.where(ok & ~solved, Status.UNCONVERGED, search.status).astype(jnp.int32)
     hits = where(status == Status.OK, hits, 0)
     return Found(hits, fermat.arrival(hits, system), status, search.steps + steps)

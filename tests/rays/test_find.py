@@ -5,11 +5,12 @@ import dataclasses
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optimistix as optx
 import pytest
 
 from drt_jax import Gauss, Scene, Status, load_lens, spot_diagram, trace_rays
 from drt_jax.pupil import hexapolar
-from drt_jax.rays import aim, find
+from drt_jax.rays import aim, fermat, find, linear
 
 from ..conftest import assert_close
 from ..known import aims, search
@@ -48,8 +49,20 @@ def test_aiming_from_crude_starts():
 
 @jax.jit
 def polished(lens, scene, points, hits, active):
-    """What the polish makes of hits."""
-    return find.polish(*aims(lens, scene, points), hits, active)
+    """What `BlockNewton` makes of hits."""
+    system, target = aims(lens, scene, points)
+
+    def function(hits, args):
+        system, target, _ = args
+        path = fermat.geometry(hits, system)
+        return (linear.shortfall(path, system, target), path), None
+
+    eps = float(jnp.finfo(hits[0].dtype).eps)
+    newton = find.BlockNewton(rtol=2 * eps, atol=2 * eps)
+    args = system, target, active
+    found = optx.root_find(function, newton, hits, args, has_aux=True, max_steps=16, throw=False)
+    successful = found.result == optx.RESULTS.successful
+    return found.value, found.state.solved, found.stats["num_steps"], successful
 
 
 @pytest.mark.slow
@@ -61,16 +74,16 @@ def test_newton_from_the_crudest_start():
         jnp.broadcast_to(c, h.shape) for c, h in zip(crossings(lens, scene, points), found.hits)
     )
     every = jnp.ones(found.status.shape, bool)
-    hits, solved, steps = polished(lens, scene, points, start, every)
-    assert np.all(solved) and int(steps) <= 8
+    hits, solved, steps, successful = polished(lens, scene, points, start, every)
+    assert np.all(solved) and successful and int(steps) <= 8
     assert_close(hits, found.hits, 1e-13)
-    hits, solved, steps = polished(lens, scene, points, start, ~every)
-    assert np.all(solved) and int(steps) == 0
+    hits, solved, steps, successful = polished(lens, scene, points, start, ~every)
+    assert np.all(solved) and successful and int(steps) == 0
     assert_close(hits, start, 0)
     hard = np.arange(5) == 3
     far = tuple(jnp.where(hard, 30.0, p) for p in points)
-    hits, solved, _ = polished(lens, scene, far, start, every)
-    assert np.all(np.asarray(solved) == ~hard)
+    hits, solved, _, successful = polished(lens, scene, far, start, every)
+    assert np.all(np.asarray(solved) == ~hard) and not successful
     for mine, wanted in zip(hits, found.hits, strict=True):
         mine, wanted = np.asarray(mine), np.asarray(wanted)
         assert np.all(np.isfinite(mine))
