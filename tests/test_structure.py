@@ -46,13 +46,13 @@ ALLOWED_ALL = {"learn.__init__", *(f"show.{name}" for name in (*_DRAWN, "sheet",
 # Most lines of code of each room; no blank, comment, docstring or import is counted. They
 # fall, and rise only by a new capability, whose commit says by how much: text is free, code is not.
 ROOMS = {
-    "drt_jax": 585,
+    "drt_jax": 588,
     "drt_jax/check": 298,
-    "drt_jax/design": 3387,
+    "drt_jax/design": 3401,
     "drt_jax/files": 3132,
     "drt_jax/image": 3043,
     "drt_jax/learn": 656,
-    "drt_jax/lens": 1872,
+    "drt_jax/lens": 1879,
     "drt_jax/pupil": 776,
     "drt_jax/rays": 1314,
     "drt_jax/show": 1255,
