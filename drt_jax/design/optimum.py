@@ -11,6 +11,7 @@ from jax import Array
 
 from ..compilation import LARGE, jit
 from ..inputs import require
+from ..lens.edit import named
 from ..lens.lens import Lens
 from ..numerics import concrete
 from ..rays.solve import solve_aimed
@@ -25,6 +26,7 @@ _NEAR, _MENDING, _STIFF = 1e-3, 20, 1e4
 # A search has converged if the relative gain that the linear model promises for a step with little
 # damping is at most `_LEFT`.
 _LEFT = 1e-6
+_AGAIN = ", re-optimised"  # behind the name of a lens: what it says may no longer be true
 _promised_gain = jax.jit(promised_gain)
 Ended = Literal["converged", "target", "steps", "limits", "stuck"]
 
@@ -32,7 +34,8 @@ Ended = Literal["converged", "target", "steps", "limits", "stuck"]
 class Optimum(NamedTuple):
     """Result of an optimisation.
 
-    lens: the best lens; of several configurations the first, see `Configurations.lenses`.
+    lens: the best lens; of several configurations the first, see `Configurations.lenses`. Its name
+        says that it is re-optimised, see `named`.
     vector: (N,), its vector.
     merit: sum of the squares of the residuals.
     score: merit plus the squares of the violations of limits.
@@ -207,8 +210,11 @@ def optimise(
         search = _mended(tried, search)
     seconds = time.perf_counter() - compiled
     limits = problem.limits(search.evaluation.constraints)
+    lens = problem.variables.lens_of(search.vector)
+    if lens.name:
+        lens = named(lens, lens.name.removesuffix(_AGAIN) + _AGAIN)
     return Optimum(
-        problem.variables.lens_of(search.vector),
+        lens,
         np.asarray(search.vector),
         float(search.merit),
         float(search.score),
