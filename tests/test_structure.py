@@ -48,7 +48,7 @@ ALLOWED_ALL = {"learn.__init__", *(f"show.{name}" for name in (*_DRAWN, "sheet",
 ROOMS = {
     "drt_jax": 588,
     "drt_jax/check": 298,
-    "drt_jax/design": 3405,
+    "drt_jax/design": 3407,
     "drt_jax/files": 3147,
     "drt_jax/image": 3043,
     "drt_jax/learn": 656,

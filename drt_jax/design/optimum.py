@@ -43,8 +43,10 @@ class Optimum(NamedTuple):
     limits: all limits by name, the largest violation first, each in its own unit.
     ended: why the search ended. "converged": all limits are met, and the linear model predicts a
         relative decrease of at most 1e-6. "target": the target merit is reached. "steps": the steps
-        are used up. "limits": the limits contradict each other. "stuck": no trial is better, for
-        instance because surfaces touch, which a limit such as air_edge prevents.
+        are used up. "limits": some are not met in the end, as of limits that contradict each other.
+        "stuck": they are met, but no trial is better, for instance because surfaces touch, which a
+        limit such as air_edge prevents; or the limits were met only by the last steps, which the
+        merit did not settle.
     history: (T, 3), merit, largest violation and number of Jacobians after each trial.
     seconds: time of all trials except the first.
     first: time of the first trial, with compilation if it is needed, s.
@@ -208,6 +210,8 @@ def optimise(
     why = _why(tried, search, target_merit)
     if why != "target" and 0 < float(search.max_violation) <= _NEAR:
         search = _mended(tried, search)
+        if why == "limits" and float(search.max_violation) <= 0:
+            why = _why(tried, search._replace(done=jnp.bool_(True)), 0.0)
     seconds = time.perf_counter() - compiled
     limits = problem.limits(search.evaluation.constraints)
     lens = problem.variables.lens_of(search.vector)
