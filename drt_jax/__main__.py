@@ -46,7 +46,7 @@ from .show.sheet import panels, sheet
 _LINES = (0.6562725, 0.5875618, 0.4861327)  # C, d, F
 # Orders of the two rules for the spots; a larger relative difference of spot size is reported.
 _ORDERS, _TOLERANCE = (14, 20), 1e-3
-_MISSING = "warn: leave out what the package has not and rays can go on without, and say so"
+_MISSING = "warn: leave out what is unsupported and rays can go on without, with a warning"
 _OTHERS = (".zmx", ".seq")
 _DEFOCUS = 3.0  # a spot larger than this many times the smallest spot is out of focus
 _WAVES = 5  # of more wavelengths of a file, the primary, longest and shortest are shown

@@ -349,7 +349,7 @@ def test_random_lenses_give_finite_moments_or_an_error():
                     dataclasses.replace(LENS, **moved), Scene.point(0.0, 1e3, GREEN)
                 )
             except ValueError as error:
-                assert "surface" in str(error) or "no way through the stop" in str(error)
+                assert "surface" in str(error) or "no path through its stop point" in str(error)
                 results.append(False)
                 continue
         assert all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(found))

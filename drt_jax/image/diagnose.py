@@ -22,7 +22,7 @@ _HOW = {
     Status.MISSED: "misses {}",
     Status.TIR: "is totally reflected at {}",
     Status.CLIPPED: "is clipped at {}",
-    Status.UNCONVERGED: "finds no way through the stop",
+    Status.UNCONVERGED: "has no path through its stop point",
     Status.NO_INDEX: "has no index",
     Status.CROSSED: "steps back to {}, which crosses its neighbour",
 }
