@@ -11,7 +11,7 @@ import reprlib
 import stat
 import sys
 import warnings
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import numpy as np
@@ -81,11 +81,17 @@ def require_tolerance(sampling: Any) -> float:
     return float(sampling)
 
 
-def require_one_of(what: str, value: object, known: Iterable[str]) -> None:
-    """Raises ValueError, which lists the known words, for a value that is none of them."""
+def require_one_of(
+    what: str, value: object, known: Iterable[str], elsewhere: Mapping[str, str] = {}
+) -> None:
+    """Raises ValueError, which lists the known words, for a value that is none of them.
+
+    elsewhere: known words by those of other programs, in small letters.
+    """
     words = [*known]
     some = f"{what}: expected one of {', '.join(words)}, got {shown(value)}"
-    require(value in words, some + nearest(value, words))
+    other = elsewhere.get(str(value)[:40].lower())
+    require(value in words, some + nearest(other or value, words))
 
 
 def nearest(value: object, known: Iterable[str]) -> str:

@@ -1,6 +1,7 @@
 """Designing a lens: variables, operands, least squares, many starts, tolerances."""
 
 from ..lens.bend import bent as bent, split as split
+from ..lens.edit import named as named
 from ..lens.insert import (
     cemented as cemented,
     inserted as inserted,

@@ -20,25 +20,29 @@ from ..rays.status import Status
 from .field_rays import EXTRAS, FieldRays, symmetry_by_structure
 from .problem import Problem
 
-# What is adjusted in every lens: the distance of the sensor, or also its tilts about x and y.
-Compensator = Literal["none", "focus", "focus and tilt"]
-_STEPS = {"none": 0, "focus": 1, "focus and tilt": 3}
+# What is adjusted in every lens: the distance of the sensor, in each configuration or once for all,
+# or also its tilts about x and y in each.
+Compensator = Literal["none", "focus", "common focus", "focus and tilt"]
+COUNTS = {"none": 0, "focus": 1, "common focus": 1, "focus and tilt": 3}
 _SYMMETRIES = ("rotational", "bilateral", "none")  # by the traced part of the pupil, smallest first
 
 
 class AsBuilt(NamedTuple):
     """A lens as built, after compensation.
 
-    squares: (V,), squared RMS radii of the spots, mm^2; inf where rays fail or no light passes.
-    moves: (C,), compensation: the shift of the sensor, mm, then its tilts about x and -y, radians;
-        or the adjustments of an `Assembly` in the units of its tolerances.
+    squares: (V,), squared RMS radii of the spots, mm^2; inf where rays fail or no light passes. Of
+        several configurations those of each, one after the other.
+    moves: (C,), compensation: the shift of the sensor, mm, then its tilts about x and -y, radians,
+        of each configuration; or the adjustments of an `Assembly` in the units of its tolerances.
     value: (), the criterion, see `Assembly`: by default the spot, the root of the mean of the
         squares, mm. Infinite, away from its target, where rays fail.
+    each: (Z,), the criterion of each configuration.
     """
 
     squares: Array
     moves: Array
     value: Array
+    each: Array
 
     @property
     def spot(self) -> Array:
@@ -72,35 +76,62 @@ def _spots(rays: FieldRays) -> tuple[Array, Array, Array]:
     return offsets, growth, jnp.concatenate([jnp.zeros_like(centre[: 2 - len(hits)]), centre])
 
 
-def compensated(lens: Lens, rays: FieldRays, compensator: Compensator) -> tuple[AsBuilt, Array]:
-    """A lens with traced rays after compensation, and its residuals. Call `check` before.
+def _with_levers(
+    lens: Lens, rays: FieldRays, compensator: Compensator
+) -> tuple[Array, Array, Array]:
+    """Distances (D, V, W Q) from the centroids and their derivatives g, see `_spots`, and how far
+    the sensor moves at each spot for each adjustment, the levers (L, V).
+
+    At a spot (x, y) the sensor moves by d n + a y + b x along its normal, where d is the change of
+    `Lens.sensor`, n the normal component of the motion of the sensor, and a, b are the tilts.
+    """
+    offsets, growth, (x, y) = _spots(rays)
+    motion = lens.sensor_motion
+    normal = jnp.ones_like(x) if motion is None else jnp.broadcast_to(motion[2], x.shape)
+    return offsets, growth, jnp.stack([normal, y, x])[: COUNTS[compensator]]
+
+
+def normal_equations(lens: Lens, rays: FieldRays, compensator: Compensator) -> tuple[Array, Array]:
+    """Matrix (L, L) and right side (L,) whose solution is the best compensation of a lens.
 
     With the distances o and their derivatives g of all rays, and the shift of the sensor t_v =
     sum_k m_k l_kv at the spot of view v (levers l: 1, y and x of the centroid), the compensation m
     solves (sum g^2 l l^T) m = -sum o g l.
+    """
+    offsets, growth, levers = _with_levers(lens, rays, compensator)
+    square = jnp.sum(growth**2, axis=(0, 2))
+    matrix = matmul(levers * square[None], levers.T)
+    return matrix, -matmul(levers, jnp.sum(offsets * growth, axis=(0, 2)))
+
+
+def solved(matrix: Array, right: Array) -> Array:
+    """The solution (L,) of normal equations; of no light the right side."""
+    if not len(right):
+        return right
+    lit = matrix[0, 0] > 0
+    return jnp.linalg.solve(jnp.where(lit, matrix, jnp.eye(len(right), dtype=right.dtype)), right)
+
+
+def compensated(
+    lens: Lens, rays: FieldRays, compensator: Compensator, moves: Array | None = None
+) -> tuple[AsBuilt, Array]:
+    """A lens with traced rays after compensation, and its residuals. Call `check` before.
+
+    moves: (L,), compensation; None for that of `normal_equations`.
 
     Returns the result, and the residuals (D, V, W Q): distances from the centroids, mm, whose
     squares add up to the squared RMS radii.
     """
-    offsets, growth, (x, y) = _spots(rays)
-    # At a spot (x, y) the sensor moves by d n + a y + b x along its normal, where d is the change
-    # of `Lens.sensor`, n the normal component of the motion of the sensor, and a, b are the tilts.
-    motion = lens.sensor_motion
-    normal = jnp.ones_like(x) if motion is None else jnp.broadcast_to(motion[2], x.shape)
-    levers = jnp.stack([normal, y, x])[: _STEPS[compensator]]
-    moves = jnp.zeros(0, x.dtype)
-    if len(levers):
-        square = jnp.sum(growth**2, axis=(0, 2))
-        matrix = matmul(levers * square[None], levers.T)
-        lit = matrix[0, 0] > 0
-        matrix = jnp.where(lit, matrix, jnp.eye(len(levers), dtype=x.dtype))
-        moves = jnp.linalg.solve(matrix, -matmul(levers, jnp.sum(offsets * growth, axis=(0, 2))))
-        offsets = offsets + growth * matmul(moves, levers)[None, :, None]
+    if moves is None:
+        moves = solved(*normal_equations(lens, rays, compensator))
+    offsets, growth, levers = _with_levers(lens, rays, compensator)
+    offsets = offsets + growth * matmul(moves, levers)[None, :, None]
     light = rays.weights[..., EXTRAS:] > 0
     failed = jnp.any(light & ~rays.arrives[..., EXTRAS:], axis=(1, 2))
     valid = ~failed & jnp.all(rays.throughput > 0, axis=1)
     squares = jnp.where(valid, jnp.sum(offsets**2, axis=(0, 2)), jnp.inf)
-    return AsBuilt(squares, moves, jnp.sqrt(jnp.mean(squares))), offsets
+    value = jnp.sqrt(jnp.mean(squares))
+    return AsBuilt(squares, moves, value, value[None]), offsets
 
 
 def check(problem: Problem, lens: Lens, compensator: str) -> None:

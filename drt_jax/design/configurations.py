@@ -191,24 +191,39 @@ class Configurations:
         """The lenses at a vector (N,) with common semi-diameters that just pass all rays of all
         configurations, see `fit_apertures`; each stop keeps its own."""
         lenses = self.lenses(vector)
-        pairs = zip(self.problems, lenses, strict=True)
-        wide = jnp.max(jnp.stack([problem.beam_radius(lens) for problem, lens in pairs]), axis=0)
-        wide = jnp.append((1 + margin) * wide, jnp.inf)
+        wide = jnp.append((1 + margin) * self.beam_radius(lenses), jnp.inf)
         return tuple(with_apertures(lens, wide) for lens in lenses)
+
+    def beam_radius(self, lenses: Sequence[Lens]) -> Array:
+        """Radius of the largest beam footprint of all configurations on each surface (S,), mm."""
+        pairs = zip(self.problems, lenses, strict=True)
+        return jnp.max(jnp.stack([problem.beam_radius(lens) for problem, lens in pairs]), axis=0)
+
+    def over(self, function: Callable, *rows: Sequence[Any]) -> list[Any]:
+        """A function of each configuration: C results, of one program for problems alike.
+
+        function: of the problem of a configuration, and of its part of the rows; it is mapped over
+            those that differ only in numbers.
+        rows: sequences of C pytrees of arrays, alike in structure.
+        """
+        found: dict[int, Any] = {}
+        for group in self.groups:
+            own = [[row[number] for number in group.numbers] for row in rows]
+            stacked = [jax.tree.map(lambda *a: jnp.stack(a), *some) for some in own]
+            each = jax.vmap(lambda own, _, *row, g=group: function(g.one(own), *row))(
+                group.own, jnp.array(group.numbers), *stacked
+            )
+            for k, number in enumerate(group.numbers):
+                found[number] = jax.tree.map(lambda a, k=k: a[k], each)
+        return [found[number] for number in sorted(found)]
 
     def evaluate_each(self, vector: Array) -> list[Evaluation]:
         """The evaluation of each configuration at a vector (N,), without the weights.
 
         Works in `jit`, `vmap` and under differentiation.
         """
-        found: dict[int, Evaluation] = {}
-        for group in self.groups:
-            each = jax.vmap(lambda own, index, g=group: g.one(own).evaluate(vector[index]))(
-                group.own, group.index
-            )
-            for k, number in enumerate(group.numbers):
-                found[number] = jax.tree.map(lambda a, k=k: a[k], each)
-        return [found[number] for number in sorted(found)]
+        parts = [vector[own] for _, _, own in self._each()]
+        return self.over(lambda problem, part: problem.evaluate(part), parts)
 
     def evaluate(self, vector: Array) -> Evaluation:
         """Residuals, constraints, overlap and number of failed rays, as `Problem.evaluate`."""
@@ -266,15 +281,41 @@ class Configurations:
     def map(self, function: Callable[[Problem], Any]) -> "Configurations":
         """The same with other problems, such as `lambda p: p.with_order(8)`.
 
-        function: from the problem of a configuration to one of the same variables.
+        function: from the problem of a configuration to one of the same variables, whose bounds
+            may be others.
         """
-        _, problems, index = zip(*self._each(), strict=True)
-        groups = _groups([*map(function, problems)], [*map(np.asarray, index)])
-        return dataclasses.replace(self, groups=groups)
+        _, old, index = zip(*self._each(), strict=True)
+        problems, shared = [*map(function, old)], self.variables
+        low, high = shared.low, shared.high
+        for own, where in zip((problem.variables for problem in problems), index):
+            low, high = low.at[where].set(own.low), high.at[where].set(own.high)
+        first = problems[0].variables
+        shared = dataclasses.replace(shared, low=low, high=high, first=first)
+        groups = _groups(problems, [*map(np.asarray, index)])
+        return dataclasses.replace(self, groups=groups, variables=shared)
 
 
 # What `optimise` takes: one configuration, or several.
 AnyProblem = Problem | Configurations
+
+
+def problems_of(problem: AnyProblem) -> list[Problem]:
+    """The problem of each configuration, or the one that is given."""
+    return problem.problems if isinstance(problem, Configurations) else [problem]
+
+
+def over(problem: AnyProblem, function: Callable, *rows: Sequence[Any]) -> list[Any]:
+    """`Configurations.over`, also of one problem, whose rows have one part."""
+    if isinstance(problem, Configurations):
+        return problem.over(function, *rows)
+    return [function(problem, *(part for (part,) in rows))]
+
+
+def shares_of(problem: AnyProblem) -> Array:
+    """Weights (C,) of the configurations of a problem, with the sum 1."""
+    if isinstance(problem, Configurations):
+        return problem.weights / len(problem.weights)
+    return jnp.ones(1, problem.fields.dtype)
 
 
 def _groups(problems: Sequence[Problem], index: Sequence[np.ndarray]) -> tuple[_Alike, ...]:

@@ -15,6 +15,7 @@ from ..lens.glass import Glass, nd_and_vd
 from ..lens.glasses import Neighbour, nearest_glasses
 from ..lens.lens import Lens, glass_rows, with_glass
 from ..rays.solve import solve_aimed
+from .configurations import AnyProblem, Configurations, problems_of
 from .media import model_glasses
 from .optimum import Optimum, init_problem, optimise, take_step
 from .problem import Problem
@@ -50,7 +51,8 @@ class Snap(NamedTuple):
 class Snapped(NamedTuple):
     """Result of `snap_glasses`.
 
-    lens: the lens with real glasses, each with its own dispersion formula.
+    lens: the lens with real glasses, each with its own dispersion formula; of several
+        configurations the first.
     optimum: the last optimisation; its lens is `lens`.
     snaps: the exchanges in their order. Exchanges of a real glass for another real glass come last.
     alternatives: by the first surface behind which a glass begins: the glasses that were tried
@@ -58,13 +60,15 @@ class Snapped(NamedTuple):
         best first; inf if rays fail. Trials meet limits only nearly, so compare a score with that
         of the trial of the glass in `lens`.
     problem: the problem in which real glasses are not varied; continue from `optimum.vector`.
+    lenses: `lens` in each configuration.
     """
 
     lens: Lens
     optimum: Optimum
     snaps: list[Snap]
     alternatives: dict[int, list[tuple[Neighbour, float]]]
-    problem: Problem
+    problem: AnyProblem
+    lenses: tuple[Lens, ...]
 
 
 class _Trial(NamedTuple):
@@ -74,7 +78,7 @@ class _Trial(NamedTuple):
 
     place: tuple[int, ...]
     near: Neighbour
-    problem: Problem
+    problem: AnyProblem
     vector: np.ndarray
     score: float
 
@@ -110,26 +114,34 @@ def _places(problem: Problem) -> list[tuple[int, ...]]:
 
 
 def _with_glass(
-    problem: Problem, vector: np.ndarray, place: tuple[int, ...], glass: Glass
-) -> tuple[Problem, np.ndarray]:
-    """The problem, and its vector (N,), with a real glass in a place.
+    problem: AnyProblem, vector: np.ndarray, place: tuple[int, ...], glass: Glass
+) -> tuple[AnyProblem, np.ndarray]:
+    """The problem, and its vector (N,), with a real glass in a place, in all configurations.
 
     The variables nd and vd of this glass are fixed at the values that mark a real glass. Only
     numbers differ, so that one compiled program serves all glasses.
     """
-    variables = problem.variables
-    scale, dtype = np.asarray(variables.scale), variables.low.dtype
-    low, high, vector = (np.array(a) for a in (variables.low, variables.high, vector))
-    for k, (kind, row, _) in enumerate(variables.places):
-        if kind in ("index", "abbe") and row in place:
-            low[k] = high[k] = vector[k] = Glass.model[kind == "abbe"] / scale[k]
-    lens, (least, most) = with_glass(variables.lens, glass, place), jnp.array([low, high], dtype)
-    own = dataclasses.replace(variables, lens=lens, low=least, high=most)
-    return dataclasses.replace(problem, variables=own), vector
+
+    def fixed(problem: Problem) -> Problem:
+        variables = problem.variables
+        scale, dtype = np.asarray(variables.scale), variables.low.dtype
+        low, high = np.array(variables.low), np.array(variables.high)
+        for k, (kind, row, _) in enumerate(variables.places):
+            if kind in ("index", "abbe") and row in place:
+                low[k] = high[k] = Glass.model[kind == "abbe"] / scale[k]
+        lens, (least, most) = (
+            with_glass(variables.lens, glass, place),
+            jnp.array([low, high], dtype),
+        )
+        own = dataclasses.replace(variables, lens=lens, low=least, high=most)
+        return dataclasses.replace(problem, variables=own)
+
+    found = problem.map(fixed) if isinstance(problem, Configurations) else fixed(problem)
+    return found, np.clip(vector, found.variables.low, found.variables.high)
 
 
 def _neighbours(
-    problem: Problem,
+    problem: AnyProblem,
     lens: Lens,
     place: tuple[int, ...],
     makers: Collection[str] | None,
@@ -140,7 +152,8 @@ def _neighbours(
     The index of each is known at all wavelengths, no two have the same constants, and none is the
     same as a medium that touches this one.
     """
-    waves, points = np.asarray(problem.wavelengths), np.asarray(nd_and_vd(lens.dispersion))
+    points = np.asarray(nd_and_vd(lens.dispersion))
+    waves = np.concatenate([np.asarray(one.wavelengths) for one in problems_of(problem)])
     rows, (nd, vd) = glass_rows(lens, place), points[place[0] + 1].tolist()
     touched = points[~rows & (np.roll(rows, 1) | np.roll(rows, -1))]
     known: set[tuple] = set()
@@ -166,7 +179,7 @@ def _snap(trial: _Trial, found: Optimum, max_steps: int) -> tuple[Snap, Optimum]
 
 
 def snap_glasses(
-    problem: Problem,
+    problem: AnyProblem,
     found: Optimum,
     makers: Collection[str] | None = ("SCHOTT",),
     accept: Callable[[Glass], bool] = ordinary_glass,
@@ -181,7 +194,7 @@ def snap_glasses(
     increases the score least, and optimises the remaining variables. At the end real glasses are
     exchanged for neighbouring glasses as long as the score falls by at least 0.1 %.
 
-    problem: the problem of the optimum.
+    problem: the problem of the optimum, of one configuration or of several, which share glasses.
     found: result of `optimise` for `problem`. The operand `glass_map` keeps its model glasses near
         real ones.
     makers: makers of the glasses, see `glass_makers`; None for all.
@@ -194,7 +207,7 @@ def snap_glasses(
 
     Compiles nothing that `optimise` has not compiled for the problem, unless a glass has more
     constants than those before. ValueError if the lens has no model glass, for an unknown maker,
-    and if no glass fits.
+    if no glass fits, and for configurations at other temperatures or with glasses of their own.
     """
 
     def run(task: tuple[tuple[int, ...], Neighbour]) -> _Trial:
@@ -207,11 +220,14 @@ def snap_glasses(
             search = take_step(tried, search)
         return _Trial(place, near, own, np.asarray(search.vector), float(search.score))
 
-    single = isinstance(problem, Problem)
-    require(single, "problem: snap_glasses takes one configuration, of `Configurations.problems`")
-    cold = problem.variables.environment is None
+    each = problems_of(problem)
+    cold = all(one.variables.environment is None for one in each)
     require(cold, "problem: snap_glasses takes one at 20 C, where its glasses are those of makers")
-    places, snaps = _places(problem), list[Snap]()
+    places, snaps = _places(each[0]), list[Snap]()
+    apart = [n for n in problem.variables.names if re.match(r"(index|abbe) .* of configuration", n)]
+    alike = not apart and all(_places(one) == places for one in each)
+    own = ", ".join(apart) or "their model glasses differ"
+    require(alike, f"problem: snap_glasses: {own}; one glass serves all configurations: share it")
     left, done = [*places], False
     while not done:
         tasks = [
@@ -237,5 +253,12 @@ def snap_glasses(
     alternatives = {p[0]: [(t.near, t.score) for t in ranked if t.place == p] for p in places}
     # In the lens of the variables, nd and vd of media without a model are exact; in `found.lens`
     # they have passed through the vector.
-    lens = dataclasses.replace(found.lens, dispersion=problem.variables.lens.dispersion)
-    return Snapped(lens, found._replace(lens=lens), snaps, alternatives, problem)
+    ends = [found.lens]
+    if isinstance(problem, Configurations):
+        ends = [*problem.lenses(found.vector)]
+    lens, *more = (
+        dataclasses.replace(end, dispersion=one.variables.lens.dispersion)
+        for end, one in zip(ends, problems_of(problem), strict=True)
+    )
+    last = found._replace(lens=lens)
+    return Snapped(lens, last, snaps, alternatives, problem, (lens, *more))

@@ -15,6 +15,21 @@ from ..numerics import concrete, leaves, safe_sqrt
 from .field_rays import FieldRays
 from .values import OPERANDS, kind_of
 
+# Operands of OpticStudio and CODE V in small letters, by what they are here.
+_KNOWN_AS = {
+    "effective_focal_length": "effl effx effy efl efx efy", "back_focal_distance": "bfl",
+    "back_distance": "imd", "entrance_pupil": "epdi epd", "f_number": "wfno isfn fno",
+    "magnification": "pmag red", "total_track": "totr", "length": "tthi oal",
+    "spot": "trac trcx trcy", "spot_chief": "trar trax tray rsch rsrh",
+    "rms_spot": "rsce rsre spd spo", "rms_wavefront": "rwce rwre rwch rwrh",
+    "path_difference": "opdc opdm opdx", "centroid": "cenx ceny",
+    "mtf": "mtfa mtft mtfs gmta gmtt gmts", "strehl": "strh", "encircled_energy": "denc genc",
+    "distortion": "dist dimx disg diy dix", "lateral_colour": "lacl", "chief_ray_angle": "rang",
+    "incidence_angle": "raid", "numerical_aperture": "isna", "relative_illumination": "reli",
+    "glass_centre": "mncg mxcg mnct mxct mnt mxt", "glass_edge": "mneg mxeg mnet mxet mne",
+    "air_centre": "mnca mxca mna", "air_edge": "mnea mxea mae",
+}  # fmt: skip
+_ELSEWHERE = {word: kind for kind, words in _KNOWN_AS.items() for word in words.split()}
 # Arguments of an operand that select values by their numbers.
 _NUMBERS = ("fields", "wavelengths", "distances", "surfaces")
 _NEEDED = "missing; give the frequency of an mtf in cycles/mm, the radius of encircled_energy in mm"
@@ -66,7 +81,7 @@ class Operand:
 
     def __post_init__(self) -> None:
         if not callable(self.kind):
-            require_one_of("operands: kind", self.kind, OPERANDS)
+            require_one_of("operands: kind", self.kind, OPERANDS, _ELSEWHERE)
         what, known = f"operands: {self.name}", kind_of(self.kind)
         for name in _NUMBERS:
             numbers = whole_numbers(f"{what}: {name}", getattr(self, name))

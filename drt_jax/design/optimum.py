@@ -11,6 +11,7 @@ from jax import Array
 
 from ..compilation import LARGE, jit
 from ..inputs import require
+from ..lens.edit import named
 from ..lens.lens import Lens
 from ..numerics import concrete
 from ..rays.solve import solve_aimed
@@ -25,6 +26,7 @@ _NEAR, _MENDING, _STIFF = 1e-3, 20, 1e4
 # A search has converged if the relative gain that the linear model promises for a step with little
 # damping is at most `_LEFT`.
 _LEFT = 1e-6
+_AGAIN = ", re-optimised"  # behind the name of a lens: what it says may no longer be true
 _promised_gain = jax.jit(promised_gain)
 Ended = Literal["converged", "target", "steps", "limits", "stuck"]
 
@@ -32,7 +34,8 @@ Ended = Literal["converged", "target", "steps", "limits", "stuck"]
 class Optimum(NamedTuple):
     """Result of an optimisation.
 
-    lens: the best lens; of several configurations the first, see `Configurations.lenses`.
+    lens: the best lens; of several configurations the first, see `Configurations.lenses`. Its name
+        says that it is re-optimised, see `named`.
     vector: (N,), its vector.
     merit: sum of the squares of the residuals.
     score: merit plus the squares of the violations of limits.
@@ -40,8 +43,10 @@ class Optimum(NamedTuple):
     limits: all limits by name, the largest violation first, each in its own unit.
     ended: why the search ended. "converged": all limits are met, and the linear model predicts a
         relative decrease of at most 1e-6. "target": the target merit is reached. "steps": the steps
-        are used up. "limits": the limits contradict each other. "stuck": no trial is better, for
-        instance because surfaces touch, which a limit such as air_edge prevents.
+        are used up. "limits": some are not met in the end, as of limits that contradict each other.
+        "stuck": they are met, but no trial is better, for instance because surfaces touch, which a
+        limit such as air_edge prevents; or the limits were met only by the last steps, which the
+        merit did not settle.
     history: (T, 3), merit, largest violation and number of Jacobians after each trial.
     seconds: time of all trials except the first.
     first: time of the first trial, with compilation if it is needed, s.
@@ -205,10 +210,15 @@ def optimise(
     why = _why(tried, search, target_merit)
     if why != "target" and 0 < float(search.max_violation) <= _NEAR:
         search = _mended(tried, search)
+        if why == "limits" and float(search.max_violation) <= 0:
+            why = _why(tried, search._replace(done=jnp.bool_(True)), 0.0)
     seconds = time.perf_counter() - compiled
     limits = problem.limits(search.evaluation.constraints)
+    lens = problem.variables.lens_of(search.vector)
+    if lens.name:
+        lens = named(lens, lens.name.removesuffix(_AGAIN) + _AGAIN)
     return Optimum(
-        problem.variables.lens_of(search.vector),
+        lens,
         np.asarray(search.vector),
         float(search.merit),
         float(search.score),

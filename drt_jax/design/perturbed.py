@@ -229,11 +229,14 @@ class Tolerance:
         Of the sensor: "sensor", its distance, mm; "sensor tilt" about x and y, arc minutes.
     size: largest deviation, in these units.
     which: numbers of surfaces or elements, from 0; () for all that have this kind of deviation.
+    own: True if the deviation of each configuration is its own, such as that of a gap which a cam
+        sets in each position of a zoom; False for one that all configurations share.
     """
 
     kind: ToleranceKind
     size: float
     which: tuple[int, ...] = ()
+    own: bool = False
 
     def __post_init__(self) -> None:
         require_one_of("tolerances: kind", self.kind, KINDS)
@@ -249,27 +252,32 @@ class Deviation(NamedTuple):
     kind: as in `Tolerance`.
     place: number of the surface or element.
     axis: component, 0 for x, 1 for y; 0 for a kind without components.
+    configuration: number of the only configuration that deviates; None if all do.
     """
 
     kind: str
     place: int
     axis: int
+    configuration: int | None = None
 
     def __str__(self) -> str:
         kind = KINDS[self.kind]
         axis = f", {'xy'[self.axis]}" if kind.axes > 1 else ""
         place = "" if kind.whole == "sensor" else f" of {kind.whole} {self.place}"
-        return f"{self.kind}{place}{axis}"
+        only = self.configuration
+        return f"{self.kind}{place}{axis}{'' if only is None else f' of configuration {only}'}"
 
 
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class PerturbedLens:
-    """A lens with P deviations.
+    """A lens with P deviations, in one configuration or in several.
 
-    lens: the nominal lens, with all arrays that the deviations need.
+    lens: the nominal lens, with all arrays that the deviations need; of several configurations the
+        first.
     beam_radius: (S,), radius of the beam footprint on each surface, mm.
     sizes: (P,), largest deviations, in the units of `Tolerance`.
+    others: nominal lenses of the other configurations.
 
     Static:
     deviations: the P deviations; the components x and y of one part follow each other.
@@ -283,50 +291,64 @@ class PerturbedLens:
     deviations: tuple[Deviation, ...] = dataclasses.field(metadata={"static": True})
     spans: tuple[tuple[int, int], ...] = dataclasses.field(metadata={"static": True})
     groups: tuple[int, ...] = dataclasses.field(metadata={"static": True}, default=())
+    others: tuple[Lens, ...] = ()
 
     @classmethod
     def from_lens(
-        cls, lens: Lens, beam_radius: Array, tolerances: Sequence[Tolerance]
+        cls, lens: Lens | Sequence[Lens], beam_radius: Array, tolerances: Sequence[Tolerance]
     ) -> "PerturbedLens":
         """The lens with the deviations that tolerances allow.
 
-        lens: the nominal lens.
-        beam_radius: (S,), mm, for instance that of `Problem.beam_radius`.
+        lens: the nominal lens, or those of several configurations, of the same parts.
+        beam_radius: (S,), mm, for instance that of `Problem.beam_radius` or, the largest of all,
+            of `Configurations.beam_radius`.
         tolerances: the tolerances.
 
-        ValueError for no tolerance, and for a part that does not exist (the message lists those
-        that do) or is named twice.
+        ValueError for no tolerance, for a part that does not exist (the message lists those that
+        do) or is named twice, and for configurations of other surfaces or elements.
         """
+        lens, *others = [lens] if isinstance(lens, Lens) else lens
         shape = np.shape(beam_radius)
         require(shape == (lens.count,), f"beam_radius: expected ({lens.count},), got shape {shape}")
         sizes: dict[Deviation, float] = {}
         for tolerance in tolerances:
-            kind, what = KINDS[tolerance.kind], f"tolerances: {tolerance.kind}"
-            possible, which = kind.places(lens), tolerance.which
-            require(possible, f"{what}: {kind.why_none}")
-            some = f"no {kind.whole} {{}} can deviate; there are {', '.join(map(str, possible))}"
-            for place in which:
-                require(place in possible, f"{what}: {some.format(place)}")
-            for place, axis in itertools.product(which or possible, range(kind.axes)):
-                one = Deviation(tolerance.kind, place, axis)
-                require(one not in sizes, f"tolerances: {one} is named twice; remove one")
-                sizes[one] = tolerance.size
+            for deviation in _deviations_of(lens, tolerance, 1 + len(others)):
+                require(
+                    deviation not in sizes, f"tolerances: {deviation} is named twice; remove one"
+                )
+                sizes[deviation] = tolerance.size
         require(sizes, "tolerances: none; name at least one")
         spans, dtype = elements_of(lens), lens.curvature.dtype
-        lens, groups = _with_parts(lens, spans, sizes)
-        largest = jnp.asarray([*sizes.values()], dtype)
-        return cls(lens, jnp.asarray(beam_radius, dtype), largest, tuple(sizes), spans, groups)
+        (lens, groups), *more = (_with_parts(one, spans, sizes) for one in (lens, *others))
+        structure: Any = jax.tree.structure(lens)
+        for number, (other, own) in enumerate(more, start=1):
+            alike = elements_of(other) == spans and own == groups
+            require(
+                alike and structure == jax.tree.structure(other),
+                f"lens: configuration {number} differs from 0 in more than numbers (surfaces, "
+                "elements, tilts that only one has); make them by `configured`",
+            )
+        numbers = jnp.asarray(beam_radius, dtype), jnp.asarray([*sizes.values()], dtype)
+        rest = tuple(other for other, _ in more)
+        return cls(lens, *numbers, tuple(sizes), spans, groups, rest)
 
-    def around(self, lens: Lens) -> "PerturbedLens":
-        """The same deviations of another nominal lens with the same surfaces. Works in `jit`."""
-        return dataclasses.replace(self, lens=_with_parts(lens, self.spans, self.deviations)[0])
+    def around(self, *lenses: Lens) -> "PerturbedLens":
+        """The same deviations of another nominal lens with the same surfaces, or of those of all
+        configurations. Works in `jit`."""
+        first, *others = (_with_parts(lens, self.spans, self.deviations)[0] for lens in lenses)
+        return dataclasses.replace(self, lens=first, others=tuple(others))
+
+    @property
+    def lenses(self) -> tuple[Lens, ...]:
+        """The nominal lens of each configuration."""
+        return self.lens, *self.others
 
     @property
     def parts(self) -> list[list[int]]:
         """Indices of the deviations of each part: one index, or those of the components x and y."""
         parts: dict[tuple, list[int]] = {}
         for k, error in enumerate(self.deviations):
-            parts.setdefault(error[:2], []).append(k)
+            parts.setdefault((*error[:2], error.configuration), []).append(k)
         return list(parts.values())
 
     def lens_of(self, perturbation: Array) -> Lens:
@@ -336,14 +358,43 @@ class PerturbedLens:
 
         perturbation: (P,), deviations in units of their largest.
         """
-        lens, by = self.lens, perturbation * self.sizes
+        return self.lenses_of(perturbation)[0]
+
+    def lenses_of(self, perturbation: Array) -> list[Lens]:
+        """The lens of each configuration with a perturbation (P,), as `lens_of`."""
+        return [
+            self._disturbed(lens, number, perturbation * self.sizes)
+            for number, lens in enumerate(self.lenses)
+        ]
+
+    def _disturbed(self, nominal: Lens, number: int, by: Array) -> Lens:
+        """The nominal lens of a configuration with deviations (P,), in the units of `Tolerance`."""
+        lens = nominal
         for kind in dict.fromkeys(error.kind for error in self.deviations):
-            own = np.array([k for k, error in enumerate(self.deviations) if error.kind == kind])
-            at, axis = np.array([self.deviations[k][1:] for k in own]).T
+            here = [error.configuration in (None, number) for error in self.deviations]
+            alike = [error.kind == kind for error in self.deviations]
+            own = np.flatnonzero(np.array(here) & np.array(alike))
+            if not len(own):
+                continue
+            at, axis = np.array([self.deviations[k][1:3] for k in own]).T
             at = np.array(self.groups)[at] if KINDS[kind].whole == "element" else at
-            errors = _Errors(self.lens, self.beam_radius, at, axis, by[own])
+            errors = _Errors(nominal, self.beam_radius, at, axis, by[own])
             lens = KINDS[kind].change(lens, errors)
         return lens
+
+
+def _deviations_of(lens: Lens, tolerance: Tolerance, configurations: int) -> list[Deviation]:
+    """The deviations that one tolerance allows; see `PerturbedLens.from_lens`."""
+    kind = KINDS[tolerance.kind]
+    possible, what = kind.places(lens), f"tolerances: {tolerance.kind}"
+    require(possible, f"{what}: {kind.why_none}")
+    some = ", ".join(map(str, possible))
+    for place in tolerance.which:
+        require(place in possible, f"{what}: no {kind.whole} {place} can deviate; there are {some}")
+    apart = tolerance.own and configurations > 1
+    each = range(configurations) if apart else [None]
+    places = itertools.product(each, tolerance.which or possible, range(kind.axes))
+    return [Deviation(tolerance.kind, place, axis, only) for only, place, axis in places]
 
 
 def _with_parts(

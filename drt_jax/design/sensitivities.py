@@ -10,8 +10,8 @@ import numpy as np
 from ..inputs import require
 from ..numerics import Numbers
 from .assembly import Assembly, Given
+from .configurations import AnyProblem
 from .perturbed import KINDS, Deviation, PerturbedLens
-from .problem import Problem
 from .tolerance import Predicted, monte_carlo
 
 # Operands in units other than mm or none: a factor and the unit in which a table shows them.
@@ -43,6 +43,7 @@ class Sensitivity(NamedTuple):
     moves: (P, 2, C), changes of the adjustments.
     adjustments: C pairs of a name and a unit.
     by: "rays" for traced lenses, "second derivatives" for a prediction.
+    each: (P, 2, Z), `after` in each of several configurations; None of one, and for a prediction.
     """
 
     criterion: str
@@ -57,6 +58,7 @@ class Sensitivity(NamedTuple):
     moves: np.ndarray
     adjustments: tuple[tuple[str, str], ...]
     by: str
+    each: np.ndarray | None = None
 
     @property
     def growth(self) -> np.ndarray:
@@ -72,9 +74,8 @@ class Sensitivity(NamedTuple):
         count: number of errors; None for all.
         """
         order = np.argsort(-self.growth, kind="stable")[:count]
-        arrays = {
-            name: getattr(self, name)[order] for name in ("sizes", "before", "after", "moves")
-        }
+        names = "sizes", "before", "after", "moves", *(() if self.each is None else ("each",))
+        arrays = {name: getattr(self, name)[order] for name in names}
         return self._replace(deviations=tuple(self.deviations[k] for k in order), **arrays)
 
     def rows(self) -> list[list[str]]:
@@ -82,10 +83,13 @@ class Sensitivity(NamedTuple):
         some, unit = self.worst(), f" ({self.unit})" if self.unit else ""
         changes = (f"{when} {sign}{unit}" for when in ("before", "after") for sign in "-+")
         moved = (f"{name} ({unit})" for name, unit in self.adjustments)
-        rows = [["error", "size", *changes, *moved]]
+        each = np.zeros((len(some.sizes), 2, 0)) if some.each is None else some.each
+        worse = (f"in configuration {number}{unit}" for number in range(each.shape[2]))
+        rows = [["error", "size", *changes, *worse, *moved]]
         for k, deviation in enumerate(some.deviations):
             size = f"{some.sizes[k]:.4g} {KINDS[deviation.kind].unit}".strip()
-            both = self.factor * np.concatenate([some.before[k], some.after[k]])
+            largest = np.argmax(np.abs(each[k]), axis=0), range(each.shape[2])
+            both = self.factor * np.concatenate([some.before[k], some.after[k], each[k][largest]])
             words = (f"{change:+.4g}" if np.isfinite(change) else "fails" for change in both)
             most = (f"{move:.3g}" for move in np.max(np.abs(some.moves[k]), axis=0, initial=0))
             rows.append([str(deviation), size, *words, *most])
@@ -112,14 +116,15 @@ class Sensitivity(NamedTuple):
 
 
 def sensitivity(
-    problem: Problem,
+    problem: AnyProblem,
     perturbed: PerturbedLens,
     compensator: Given = "focus",
     predicted: Predicted | None = None,
 ) -> Sensitivity:
     """What each error alone does, at its largest in both directions.
 
-    problem: gives the fields, wavelengths and pupil rule.
+    problem: gives the fields, wavelengths and pupil rule; `Configurations` those of several, over
+        which the criterion is the mean. The table has the change of each, of the worse direction.
     perturbed: the lens and its errors.
     compensator: as in `as_built`; an `Assembly` has another criterion than spots.
     predicted: what `predict` has found with the same arguments: the table is then that of second
@@ -127,12 +132,12 @@ def sensitivity(
 
     ValueError as in `as_built`, and for a lens that fails without errors.
     """
-    assembly = Assembly.of(compensator).placed(problem, perturbed.lens, perturbed.beam_radius)
+    assembly = Assembly.of(compensator).placed(problem, perturbed.lenses, perturbed.beam_radius)
     count = len(perturbed.deviations)
     ends = np.concatenate([-np.eye(count), np.eye(count), np.zeros((1, count))])
     if predicted is None:
         built = monte_carlo(problem, perturbed, ends, assembly)
-        moves = np.asarray(built.moves)
+        moves, each = np.asarray(built.moves), np.asarray(built.each)
         values = held = np.asarray(built.value)
         if moves.shape[1]:
             fixed = dataclasses.replace(assembly, held=built.moves[-1])
@@ -141,16 +146,17 @@ def sensitivity(
         both = [predicted, predicted.before or predicted]
         values, held = (np.asarray(assembly.value(m.at(ends, "second"))) for m in both)
         moves = ends @ np.asarray(predicted.move_slopes)
+        each = np.zeros((len(ends), 0))
     figure, parts = assembly.figure, assembly.parts
     factor, unit = _UNITS.get(figure.name, (1.0, ""))
-    named = _FOCUS[: moves.shape[1]]
+    named = _names_of_focus(moves.shape[1], 1 + len(perturbed.others))
     if parts is not None:
         named = tuple((str(one), KINDS[one.kind].unit) for one in parts.deviations)
     values, held, moves = (np.asarray(array, float) for array in (values, held, moves))
-    pairs = (np.stack([a[:count], a[count : 2 * count]], axis=1) for a in (held, values))
     _require_nominal(float(values[-1]))
-    before, after = (pair - values[-1] for pair in pairs)
-    shifts = moves - moves[-1]
+    changes = (held - values[-1], values - values[-1], moves - moves[-1], each - each[-1])
+    pairs = (np.stack([a[:count], a[count : 2 * count]], axis=1) for a in changes)
+    before, after, shifts, each = pairs
     return Sensitivity(
         figure.name.replace("_", " ") + _AT.get(figure.name, "").format(figure.at),
         unit,
@@ -161,14 +167,24 @@ def sensitivity(
         np.asarray(perturbed.sizes, float),
         before,
         after,
-        np.stack([shifts[:count], shifts[count : 2 * count]], axis=1),
+        shifts,
         named,
         "rays" if predicted is None else "second derivatives",
+        each if perturbed.others and predicted is None else None,
     )
 
 
+def _names_of_focus(count: int, configurations: int) -> tuple[tuple[str, str], ...]:
+    """Names and units of `count` adjustments of the sensor, of each configuration or of all."""
+    if configurations == 1 or count <= 1:
+        return _FOCUS[:count]
+    own = _FOCUS[: count // configurations]
+    numbers = range(configurations)
+    return tuple((f"{name} of configuration {k}", unit) for k in numbers for name, unit in own)
+
+
 def inverse_sensitivity(
-    problem: Problem,
+    problem: AnyProblem,
     perturbed: PerturbedLens,
     compensator: Given,
     drop: float,
@@ -193,7 +209,7 @@ def inverse_sensitivity(
     """
     require(0 < drop < np.inf, f"drop: must be above 0 and finite, got {drop:g}")
     require(0 < most < np.inf, f"most: must be above 0 and finite, got {most:g}")
-    assembly = Assembly.of(compensator).placed(problem, perturbed.lens, perturbed.beam_radius)
+    assembly = Assembly.of(compensator).placed(problem, perturbed.lenses, perturbed.beam_radius)
     signs, count = np.array([-1.0, 1.0]), len(perturbed.deviations)
     bounds = [KINDS[deviation.kind].most for deviation in perturbed.deviations]
     top = np.minimum(most, 0.99 * np.array(bounds) / np.asarray(perturbed.sizes))[:, None]
@@ -257,10 +273,12 @@ def _parabola_sizes(size: np.ndarray, fell: np.ndarray, top: np.ndarray, drop: f
 def yields(values: np.ndarray, levels: Numbers, compensator: Given = "focus") -> np.ndarray:
     """Fractions (L,) of lenses as built that are as good as each level, or better.
 
-    values: (K,), criterion of lenses, as `monte_carlo` returns it.
+    values: (K,), criterion of lenses, as `monte_carlo` returns it; or (K, Z), of each of Z
+        configurations (`AsBuilt.each`), of which all have to be as good as the level.
     levels: (L,), in the unit of the criterion.
     compensator: the `Assembly` of the lenses, which has the criterion.
     """
     loss = Assembly.of(compensator).loss
     allowed = np.asarray(loss(np.asarray(levels, float)))
-    return np.mean(np.asarray(loss(np.asarray(values)))[:, None] <= allowed[None], axis=0)
+    worst = np.asarray(loss(np.asarray(values))).reshape(len(values), -1).max(axis=1)
+    return np.mean(worst[:, None] <= allowed[None], axis=0)

@@ -23,8 +23,9 @@ from ..lens.lens import Lens
 from ..numerics import Numbers, concrete, matmul, real_array
 from ..pupil.rules import Gauss
 from ..rays.solve import solve_aimed
-from .assembly import Assembly, Given
+from .assembly import Assembly, Given, mean_of
 from .compensation import AsBuilt, Compensator, compensated
+from .configurations import AnyProblem, over, shares_of
 from .field_rays import FieldRays, symmetry_by_structure, trace_views
 from .perturbed import KINDS, PerturbedLens
 from .problem import Problem, trace_fields
@@ -81,7 +82,7 @@ def variances(perturbed: PerturbedLens, normal: bool = False) -> np.ndarray:
 
 
 def monte_carlo(
-    problem: Problem,
+    problem: AnyProblem,
     perturbed: PerturbedLens,
     perturbation: np.ndarray,
     compensator: Given,
@@ -94,7 +95,7 @@ def monte_carlo(
     The result does not depend on threads, tiles or devices. Where aiming misses a ray, the full ray
     search decides whether the ray exists.
 
-    problem: gives the fields, wavelengths and pupil rule.
+    problem: gives the fields, wavelengths and pupil rule; `Configurations` those of several.
     perturbed: the lens and its deviations.
     perturbation: (K, P), deviations in units of their largest.
     compensator: as in `as_built`.
@@ -103,16 +104,16 @@ def monte_carlo(
     mesh: devices that share the lenses, of `devices.device_mesh`. A tile then has 50 lenses for
         every device, and `threads` is not used. None for the default device.
 
-    Returns squares (K, V), mm^2, moves (K, C) and values (K,) of all lenses. ValueError as in
-    `as_built`.
+    Returns squares (K, V), mm^2, moves (K, C) and values (K,) of all lenses, and values (K, Z) of
+    each of Z configurations. ValueError as in `as_built`.
     """
-    assembly = Assembly.of(compensator).placed(problem, perturbed.lens, perturbed.beam_radius)
+    assembly = Assembly.of(compensator).placed(problem, perturbed.lenses, perturbed.beam_radius)
     shape, width = np.shape(perturbation), len(perturbed.deviations)
     valid = len(shape) == 2 and shape[0] and shape[1] == width
     require(valid, f"perturbation: expected (K, {width}), got shape {shape}")
     rows = np.asarray(perturbation, perturbed.sizes.dtype)
 
-    def traced(problem: Problem, rows: np.ndarray, callback: Callable[[int], None]) -> AsBuilt:
+    def traced(problem: AnyProblem, rows: np.ndarray, callback: Callable[[int], None]) -> AsBuilt:
         parts: list[AsBuilt] = []
         whole = problem, perturbed, assembly
         for part in in_tiles(_many, whole, rows, _TILE, threads, mesh):
@@ -132,7 +133,7 @@ def monte_carlo(
 
 @partial(jit, wanted=LARGE, static_argnames="mesh")
 def _many(
-    problem: Problem,
+    problem: AnyProblem,
     perturbed: PerturbedLens,
     assembly: Assembly,
     perturbation: Array,
@@ -140,8 +141,10 @@ def _many(
 ) -> AsBuilt:
     """The lenses of one tile, shared among the devices of a mesh."""
 
-    def one(problem: Problem, perturbed: PerturbedLens, assembly: Assembly, row: Array) -> AsBuilt:
-        return assembly.built(problem, perturbed.lens_of(row))
+    def one(
+        problem: AnyProblem, perturbed: PerturbedLens, assembly: Assembly, row: Array
+    ) -> AsBuilt:
+        return assembly.built(problem, perturbed.lenses_of(row))
 
     many = shared(jax.vmap(one, (None, None, None, 0)), mesh, 3)
     return many(problem, perturbed, assembly, perturbation)
@@ -253,7 +256,7 @@ class Predicted(NamedTuple):
         return mean, jnp.sqrt(matmul(self.gradient**2, variances) + pairs)
 
 
-def predict(problem: Problem, perturbed: PerturbedLens, compensator: Given) -> Predicted:
+def predict(problem: AnyProblem, perturbed: PerturbedLens, compensator: Given) -> Predicted:
     """Predicts q from exact first and second derivatives by deviations.
 
     Adjustments count as further deviations z = (p, m) of a lens that is adjusted at first; those
@@ -268,7 +271,7 @@ def predict(problem: Problem, perturbed: PerturbedLens, compensator: Given) -> P
 
     ValueError as in `as_built`, and for a criterion whose second derivatives are not finite.
     """
-    assembly = Assembly.of(compensator).placed(problem, perturbed.lens, perturbed.beam_radius)
+    assembly = Assembly.of(compensator).placed(problem, perturbed.lenses, perturbed.beam_radius)
     if not concrete((problem, perturbed)):
         return _predict(problem, perturbed, assembly)
     found = _predict(problem.with_solver(solve_aimed), perturbed, assembly)
@@ -284,17 +287,24 @@ def predict(problem: Problem, perturbed: PerturbedLens, compensator: Given) -> P
 
 
 @partial(jit, wanted=ONCE)
-def _predict(problem: Problem, perturbed: PerturbedLens, assembly: Assembly) -> Predicted:
+def _predict(problem: AnyProblem, perturbed: PerturbedLens, assembly: Assembly) -> Predicted:
     """`predict` with the solver of the problem: J from one linearised trace, Hessians by forward
     over reverse mode. Second derivatives of a whole trace are large to compile and run once.
     """
-    moves = jax.lax.stop_gradient(assembly.moves(problem, perturbed.lens))
+    moves = jax.lax.stop_gradient(assembly.moves(problem, perturbed.lenses))
+    shares = shares_of(problem)
     zero = jnp.append(jnp.zeros_like(perturbed.sizes), moves)
     count, units = len(perturbed.sizes), jnp.eye(len(zero), dtype=zero.dtype)
 
     def measures(z: Array) -> tuple[Array, Array]:
         """The residuals of which q is the sum of squares, and q and S."""
-        lens = assembly.adjusted(perturbed.lens_of(z[:count]), z[count:])
+        lenses = assembly.adjusted(perturbed.lenses_of(z[:count]), z[count:])
+        residuals, both = zip(*over(problem, measures_of_one, lenses), strict=True)
+        parts = [root * own for root, own in zip(jnp.sqrt(shares), residuals, strict=True)]
+        return jnp.concatenate(parts), jax.vmap(partial(mean_of, problem))(jnp.stack(both, axis=1))
+
+    def measures_of_one(problem: Problem, lens: Lens) -> tuple[Array, Array]:
+        """`measures` of one configuration."""
         rays = trace_fields(problem, lens)
         valid = jnp.all(jnp.isfinite(compensated(lens, rays, "none")[0].squares))
         residuals, q = assembly.measure(lens, rays)
@@ -303,14 +313,14 @@ def _predict(problem: Problem, perturbed: PerturbedLens, assembly: Assembly) -> 
 
     def curved(unit: tuple[Array, Array]) -> tuple[Array, Array]:
         """Gradient and Hessian, along a vector, of a combination of q and S."""
-        vector, shares = unit
-        gradient = jax.grad(lambda z: jnp.dot(shares, measures(z)[1]))
+        vector, which = unit
+        gradient = jax.grad(lambda z: jnp.dot(which, measures(z)[1]))
         return jax.jvp(gradient, (zero,), (vector,))
 
     _, derivative, values = jax.linearize(measures, zero, has_aux=True)
     jacobian = jax.lax.map(derivative, units)
-    shares = jnp.repeat(jnp.eye(2, dtype=zero.dtype), np.array([len(zero), len(moves)]), axis=0)
-    gradients, rows = jax.lax.map(curved, (jnp.concatenate([units, units[count:]]), shares))
+    which = jnp.repeat(jnp.eye(2, dtype=zero.dtype), np.array([len(zero), len(moves)]), axis=0)
+    gradients, rows = jax.lax.map(curved, (jnp.concatenate([units, units[count:]]), which))
     hessian, square = rows[: len(zero)], rows[len(zero) :]
     free = assembly.free(moves)  # an adjustment at its limit stays there
     pulls = jnp.where(free[:, None] & free[None], square[:, count:], 0)

@@ -21,7 +21,16 @@ from .record import (
 )
 from .seq_glass import Glasses
 from .seq_surfaces import MOVES, ON_SURFACES, Surface, move
-from .seq_text import COSMETIC, REFUSED, SOLVES, SURFACE, Command, command_of, commands_of
+from .seq_text import (
+    COSMETIC,
+    REFUSED,
+    SOLVES,
+    SURFACE,
+    Command,
+    command_of,
+    commands_of,
+    micrometres,
+)
 from .specs import SURFACES
 
 _UNITS = {"M": 1.0, "MM": 1.0, "C": 10.0, "CM": 10.0, "I": 25.4, "IN": 25.4}
@@ -208,7 +217,7 @@ def _finish(reader: _Reader) -> None:
     """Do the checks and conversions that need all commands."""
     record, surfaces = reader.record, reader.surfaces
     use, require = record.use, record.require
-    waves = use.wavelengths = [value / 1000 for value in reader.lists.get("WL", [])]
+    waves = use.wavelengths = [*map(micrometres, reader.lists.get("WL", []))]
     require(surfaces, 0, "no surface, SO, S or SI: is it a .seq file?")
     whole = reader.complete and len(surfaces) > 2
     require(whole, surfaces[-1].line, "no SI follows, the image: is the file cut short?")

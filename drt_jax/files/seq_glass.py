@@ -9,7 +9,7 @@ from ..lens.glasses import plain_names
 from .glasses import code_of, in_catalogues, named_glass, require_glass
 from .record import Record, short
 from .seq_surfaces import Surface
-from .seq_text import Command
+from .seq_text import Command, micrometres
 
 _POWERS = (0, -2, 2, -4, -6, -8)  # of L in Schott's formula; each further index adds one
 _SCHOTT = (0, 2, -2, -4, -6, -8)
@@ -38,7 +38,7 @@ class Glasses:
             known = bool(values) and 0.1 <= min(values) <= max(values) <= 1e9
             command.require(known, "PWL: expected wavelengths in nm")
             command.require(len({*values}) == len(values), "PWL: a wavelength stands twice")
-            self.waves = [value / 1000 for value in values]
+            self.waves = [*map(micrometres, values)]
             return
         command.require(len(self.tables) < _MOST, f"more than {_MOST} private glasses")
         self.tables[command.key.upper()] = command, self.waves

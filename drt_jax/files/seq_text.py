@@ -3,6 +3,7 @@
 import dataclasses
 import re
 from collections.abc import Iterator
+from decimal import Decimal
 
 from ..inputs import InputError, one_line
 from .record import LONGEST, Record, Words
@@ -50,6 +51,11 @@ class Command(Words):
     def of(self, letter: str) -> tuple[str, str] | None:
         """First and last of a qualifier such as S3 or S3..5; None if it is not given."""
         return next((q[1:] for q in self.qualifiers if q[0] == letter), None)
+
+
+def micrometres(nanometres: float) -> float:
+    """A wavelength in um, rounded once: 587.5618 nm are 0.5875618 um."""
+    return float(Decimal(repr(nanometres)).scaleb(-3))
 
 
 def _cut(text: str) -> tuple[list[str], bool]:

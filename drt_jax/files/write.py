@@ -16,7 +16,14 @@ from .entry import LensError, require
 from .load import System, known_ending, lens_in, system_for
 from .write_seq import seq_text
 from .write_zmx import zmx_text
-from .written import element_of, entry_of, media_of_lens, place_of, shapes_of
+from .written import (
+    element_of,
+    entry_of,
+    media_of_lens,
+    place_of,
+    shapes_of,
+    with_short_numbers,
+)
 
 # How far the index of a private glass may be off at more wavelengths than it can be made for.
 _PRIVATE = 1e-6
@@ -27,7 +34,8 @@ _CLOSE = 1e-9  # relative, and in mm, of what is read back; rounding of float32 
 def save_lens(lens: Lens | System | Sequence[Lens | System], path: str | pathlib.Path) -> None:
     """Write a lens as a YAML prescription, or as a file of Zemax or CODE V if the path ends in
     `.zmx` or `.seq`. `load_lens` reads the same lens from it, to the last digit (tilts, which files
-    hold in degrees, and model glasses and radii in `.zmx`: to the last digit but one).
+    hold in degrees, and model glasses and radii in `.zmx`: to the last digit but one; a number that
+    differs in the last bit from one of at most 12 digits is written as that).
 
     The text is read back before it becomes a file: if curvatures, thicknesses, places, indices at
     the wavelengths, the stop, apertures or, of a `System`, distance, fields, vignetting and
@@ -57,6 +65,7 @@ def save_lens(lens: Lens | System | Sequence[Lens | System], path: str | pathlib
             warn(f"{path}: fields, wavelengths and vignetting are not written")
     try:
         text = {".zmx": zmx_text, ".seq": seq_text}.get(kind, _yaml_text)(systems)
+        text = with_short_numbers(text)
         for system in systems:
             system.lens.check()
     except LensError:

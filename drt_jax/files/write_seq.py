@@ -27,6 +27,7 @@ from .record import turns_of
 from .seq import FIELDS, VIGNETTING
 from .seq_glass import folded, schott_through
 from .seq_surfaces import LETTERS, MOVES, RADIAL, SIZES
+from .seq_text import micrometres
 from .written import (
     degrees_of,
     differing,
@@ -159,7 +160,7 @@ def _made(keys: dict[str, Any], waves: np.ndarray) -> tuple[dict[str, Any], floa
 
 
 def _nanometres(wave: float) -> float:
-    return number_for(wave, lambda value: value / 1000, round(wave * 1000, 9))
+    return number_for(wave, micrometres, wave * 1000)
 
 
 def _private(name: str, called: str, constants: dict[str, Any]) -> list[str]:

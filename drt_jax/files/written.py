@@ -1,6 +1,7 @@
 """A lens as entries of a prescription, from which all kinds of files are written."""
 
 import math
+import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
@@ -14,14 +15,37 @@ from ..lens.glasses import find_glass, glass_names
 from ..lens.lens import Lens
 from .entry import require
 
+# Most digits of a number that a person types; numbers of a file that may be such a one after
+# rounding.
+_TYPED = 12
+_LONG = re.compile(r"(?<![\w.])-?\d+\.\d{9,}(e[-+]?\d+)?(?![\w.])")
 Shape = tuple[bool, str, list[float], list[float]]
 
 
 def number_for(target: float, read: Callable[[float], float], *guesses: float) -> float:
-    """The first of `guesses`, or the number near the last, that `read` maps to `target`, or as
-    close to it as possible."""
-    near = (guesses[-1] + np.arange(-8, 9) * np.spacing(abs(guesses[-1]))).tolist()
-    return min([*guesses, *near], key=lambda number: abs(read(number) - target))
+    """The shortest decimal of the last of `guesses`, else the first of them, or the number near the
+    last, that `read` maps to `target`, or as close to it as possible."""
+    last = guesses[-1]
+    near = (last + np.arange(-8, 9) * np.spacing(abs(last))).tolist()
+    return min([*_decimals(last), *guesses, *near], key=lambda number: abs(read(number) - target))
+
+
+def _decimals(number: float) -> list[float]:
+    """A number rounded to decimals, the shortest first."""
+    return [float(f"{number:.{digits}g}") for digits in range(1, _TYPED + 1)]
+
+
+def with_short_numbers(text: str) -> str:
+    """The text of a file with decimals as a person types them: those of at most 12 digits in place
+    of numbers that differ in the last bit, such as 587.5618 for 587.5618000000001."""
+
+    def short(match: re.Match[str]) -> str:
+        number = float(match[0])
+        near = (own for own in _decimals(number) if abs(own - number) <= np.spacing(abs(number)))
+        found = next(map(repr, near), match[0])
+        return found if "." in found else found.replace("e", ".0e")  # as YAML knows numbers
+
+    return _LONG.sub(short, text)
 
 
 def degrees_of(angles: Any) -> list[float]:

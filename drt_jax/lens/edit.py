@@ -145,6 +145,15 @@ def reindexed(lens: Lens, rows: Sequence[int], media: Sequence[int], thickness: 
     )
 
 
+def named(lens: Lens, name: str) -> Lens:
+    """The lens with another name, which stands on sheets and in files.
+
+    lens: the lens.
+    name: its name.
+    """
+    return dataclasses.replace(lens, labels=Labels(name, lens.glasses))
+
+
 def flipped(lens: Lens) -> Lens:
     """The lens reversed: light takes each path backwards.
 

@@ -194,7 +194,7 @@ class Lens:
 
     def __repr__(self) -> str:
         """A short description; it also works for a gradient and inside a trace."""
-        what = f"{self.count} surfaces, the stop is number {self.stop}"
+        what = f"{self.count} surfaces, stop: surface {self.stop}"
         sensor = self.sensor
         if concrete(sensor) and getattr(sensor, "shape", None) == ():
             what += f", sensor {float(sensor):.6g}"

@@ -2,7 +2,7 @@
 
 import itertools
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -85,11 +85,21 @@ def crossings(lens: Lens, pairs: Sequence[Pair]) -> list[float | None]:
     semi, senses, found = np.asarray(lens.semi_diameter), lens.senses, []
     for pair, y, (front, back) in zip(pairs, *heights(lens, pairs), strict=True):
         with np.errstate(invalid="ignore"):  # sags may be inf, or no number
-            crossed = senses[pair.second] * (front - back) - pair.gap > _TOUCH
+            overlap = senses[pair.second] * (front - back) - pair.gap
+            crossed = overlap > _TOUCH
         limited = pair.second < lens.count and not np.all(np.isinf(semi[[*pair[:2]]]))
-        place = float(y[np.argmax(crossed)]) if limited and np.any(crossed) else None
+        place = _zero(y, overlap, np.argmax(crossed)) if limited and np.any(crossed) else None
         found.append(0.0 if pair.gap <= 0 and pair.second < lens.count else place)
     return found
+
+
+def _zero(y: np.ndarray, overlap: np.ndarray, at: Any) -> float:
+    """The height before y[at] from which surfaces with an overlap (Y,) at heights (Y,) overlap."""
+    apart = np.flatnonzero(overlap[:at] <= 0)
+    if not len(apart) or not np.isfinite(overlap[apart[-1] + 1]):
+        return float(y[at])
+    pair = slice(apart[-1], apart[-1] + 2)
+    return float(np.interp(0.0, overlap[pair], y[pair]))
 
 
 def may_cross(lens: Lens) -> bool:
@@ -115,11 +125,11 @@ def neighbours_now(lens: Lens) -> list[Pair]:
     return neighbours(lens, [*gaps, float(lens.sensor) - sum(gaps)], moved)
 
 
-def describe_crossing(lens: Lens, pair: Pair, place: float) -> str:
+def describe_crossing(pair: Pair, place: float) -> str:
     """A sentence that says that two neighbours cross.
 
     place: height where they cross, mm, see `crossings`.
     """
-    second = "the sensor" if pair.second == lens.count else f"surface {pair.second}"
-    where = f"from {place:.3g} mm off the axis on" if place else "on the axis"
-    return f"surface {pair.first} and {second} cross {where}: {pair.gap:.4g} mm between them"
+    where = f"at y = {place:.4g} mm" if place else "on the axis"
+    both = f"surfaces {pair.first} and {pair.second}"
+    return f"{both} cross {where}: {pair.gap:.4g} mm between their vertices"

@@ -25,7 +25,7 @@ def longitudinal(
         axes.plot(np.where(np.isfinite(real), real, np.nan), np.asarray(heights), **style)
         axes.plot([paraxial], [0], "o", color=style["color"], markersize=3)
     axes.axvline(0, color="0.7", linewidth=0.6, zorder=0)
-    axes.set(ylim=(0, 1), xlabel="focus from the sensor (mm)", ylabel="stop $P_y$")
+    axes.set(ylim=(0, 1), xlabel="focus from the sensor (mm)", ylabel="pupil $P_y$")
     return axes
 
 
@@ -92,7 +92,7 @@ def wavefront_map(axes: Axes, opd: ArrayLike) -> Axes:
     if inside.size:
         size = f"PV {np.ptp(inside):.3g}, RMS {np.std(inside):.3g} waves"
         axes.set_title(size, fontsize=8)
-    axes.set(xlabel="stop $P_x$", ylabel="stop $P_y$")
+    axes.set(xlabel="pupil $P_x$", ylabel="pupil $P_y$")
     return axes
 
 

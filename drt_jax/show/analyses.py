@@ -115,7 +115,7 @@ def field_curvature(
     axes: Axes, found: FieldCurvature, fields: ArrayLike, wavelengths: ArrayLike
 ) -> Axes:
     """Foci over the field, mm from the sensor: solid lines are tangential, dashed sagittal."""
-    return _over_field(axes, found, fields, wavelengths, "focus (mm), T solid, S dashed")
+    return _over_field(axes, found, fields, wavelengths, "field curvature (mm), T solid, S dashed")
 
 
 def distortion(axes: Axes, found: Distortion, fields: ArrayLike, wavelengths: ArrayLike) -> Axes:
@@ -287,7 +287,7 @@ def _over_pupil(
     axes.axhline(0, color="0.7", linewidth=0.6, zorder=0)
     axes.axvline(0, color="0.7", linewidth=0.6, zorder=0)
     along = "x" if " along x" in name or "e_x" in name else "y"
-    axes.set(xlim=(-1, 1), xticks=(-1, 0, 1), xlabel=f"stop $P_{along}$", ylabel=name)
+    axes.set(xlim=(-1, 1), xticks=(-1, 0, 1), xlabel=f"pupil $P_{along}$", ylabel=name)
     if half:
         axes.set(ylim=(-half, half), yticks=(-half, 0, half))
     return axes

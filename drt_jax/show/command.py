@@ -38,7 +38,7 @@ _ORDERS, _TOLERANCE = (14, 20), 1e-3
 OTHERS = (".zmx", ".seq")
 _DEFOCUS = 3.0  # a spot larger than this many times the smallest spot is out of focus
 _WAVES = 5  # of more wavelengths of a file, the primary, longest and shortest are shown
-MISSING = "warn: leave out what the package has not and rays can go on without, and say so"
+MISSING = "warn: leave out what is unsupported and rays can go on without, with a warning"
 WHICH = "number of a configuration or zoom position of a .zmx or .seq file, from 1"
 _NO_SIZE = 1e-9  # mm, mrad: a smaller spot is only rounding error
 # A line of text, or a row of a table.

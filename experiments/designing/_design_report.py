@@ -42,7 +42,7 @@ def tables(results: dict[str, Any]) -> dict[str, str]:
         rows += [[f"focus at {um:.4f} um, over the focal length", place] for um, place in foci]
     if starts["merits"]:
         rows += [["starts that pass light", starts["passed"]], ["minima", len(starts["merits"])]]
-        rows += [["minima a minute", 60 * len(starts["merits"]) / max(starts["seconds"], 1e-9)]]
+        rows += [["minima per minute", 60 * len(starts["merits"]) / max(starts["seconds"], 1e-9)]]
     if results["how"] == "as_built":
         rows.append(["starts no worse than the lens", f"{starts['no_worse']} of {starts['count']}"])
     name = row["problem"]

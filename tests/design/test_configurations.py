@@ -236,11 +236,7 @@ def test_what_does_not_fit_is_refused(message):
         Configurations.from_problems([other(**one) for one in given], own)
 
 
-def test_glasses_take_one_configuration():
-    both = Configurations.from_problems([other(), other()])
-    with pytest.raises(ValueError, match="problem: snap_glasses takes one configuration"):
-        design.snap_glasses(both, None)
-    # Updates are led back within the bounds of all.
+def test_updates_are_led_back_within_the_bounds_of_all():
     shared = Configurations.from_problems(
         [other(vary=[Vary("sensor", low=low)]) for low in (41.5, 42.0)]
     )

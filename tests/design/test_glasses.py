@@ -190,6 +190,81 @@ def test_what_cannot_snap_is_refused():
             drt_jax.with_glass(lens, find_glass(glass), surfaces)
 
 
+LINES = (WAVES, np.array([0.6562725, 0.75, 0.8521101]))  # by day and by night
+
+
+def thin_by_day_and_night(crown, flint):
+    """`thin` of a doublet that is focused at three lines by day and at three by night."""
+    pairs = []
+    for lines in LINES:
+        n = np.array([indices(find_glass(name), lines) for name in (crown, flint)])
+        d = np.array([indices(find_glass(name), WAVES[1:2]) for name in (crown, flint)])
+        u, w = (n - 1) / (d - 1)
+        pairs.append((u - u.mean(), w - w.mean()))
+    u, w = np.concatenate(pairs, axis=1)
+    power = -np.dot(w, u - w) / np.dot(u - w, u - w)
+    return np.sum((power * u + (1 - power) * w) ** 2) / 3
+
+
+@pytest.mark.slow
+def test_one_pair_of_glasses_serves_all_configurations():
+    """A slow doublet by day and by night, refocused: each exchange as thin lenses have it."""
+    lens, problems = drt_jax.load_lens(DOUBLET), []
+    vary = [
+        Vary("curvature"),
+        Vary("index", (0,), low=1.45, high=1.60),
+        Vary("index", (1,), low=1.55, high=1.70),
+        Vary("abbe", (0,), low=60, high=70),
+        Vary("abbe", (1,), low=35, high=45),
+        "sensor",
+    ]
+    focal = Operand("effective_focal_length", low=FOCAL - 1e-3, high=FOCAL + 1e-3)
+    for lines in LINES:
+        scene = Scene.radians(0.0, wavelengths=lines)
+        own = Variables.from_lens(lens, vary)
+        own_operands = [Operand("spot", weight=1e3), *([focal] if lines is WAVES else [])]
+        problems.append(design.Problem.from_variables(own, own_operands, scene, 2))
+    both = design.Configurations.from_problems(problems, ["sensor"])
+    found = design.optimise(both, max_steps=60)
+    accept = lambda glass: glass.name in NAMES  # noqa: E731
+    best = design.snap_glasses(both, found, accept=accept, max_steps=60)
+    pair = best.lens.glasses[1:3]
+    assert {*pair} <= {*NAMES}
+    day, night = best.lenses
+    assert day.glasses == night.glasses and float(day.sensor) != float(night.sensor)
+    for lens in best.lenses:
+        np.testing.assert_allclose(lens.index(LINES[1])[1], indices(find_glass(pair[0]), LINES[1]))
+    size = (1e3 * SEMI) ** 2 / 2
+    np.testing.assert_allclose(best.optimum.merit, size * thin_by_day_and_night(*pair), rtol=0.02)
+    np.testing.assert_allclose(best.problem.merit(best.optimum.vector), best.optimum.merit)
+    for name in NAMES:  # no other glass in one place is better
+        for other in ((name, pair[1]), (pair[0], name)):
+            if other[0] != other[1]:
+                assert thin_by_day_and_night(*other) > 0.98 * thin_by_day_and_night(*pair)
+
+
+def test_glasses_of_configurations_are_shared():
+    """Two lengths of one lens, without rays: a glass goes into both; none of its own is taken."""
+    rows = [{"radius": "inf", "thickness": 1.0, "nd": 1.52, "vd": 64.0, "stop": True}]
+    rows[0]["semi_diameter"] = 1.0
+    lens = drt_jax.load_lens({"surfaces": [*rows, {"radius": "inf"}], "sensor": 9.0})
+    problems = [
+        design.Problem.from_variables(
+            Variables.from_lens(lens, ["index", "abbe", "sensor"]),
+            [Operand("total_track", target=length)],
+        )
+        for length in (9.5, 10.5)
+    ]
+    both = design.Configurations.from_problems(problems, ["sensor"])
+    found = design.optimise(both, max_steps=10)
+    best = design.snap_glasses(both, found, count=2, steps=2, max_steps=5)
+    assert best.lenses[0].glasses[1] == best.lenses[1].glasses[1] == best.snaps[0].glass
+    np.testing.assert_allclose([lens.sensor for lens in best.lenses], [9.5, 10.5], atol=1e-6)
+    apart = design.Configurations.from_problems(problems, ["sensor", "index"])
+    with pytest.raises(ValueError, match="index 0 of configuration 0, .*; one glass serves all"):
+        design.snap_glasses(apart, found)
+
+
 def test_tied_glasses_are_one():
     """Crown, flint, crown; nd and vd of the crowns are tied, and are one glass in the end."""
     rows = [

@@ -469,3 +469,11 @@ def test_kinds_as_type_checkers_know_them():
     known = ((operands.OperandName, OPERANDS), (parts.VariableKind, PARTS))
     for literal, table in (*known, (perturbed.ToleranceKind, perturbed.KINDS)):
         assert get_args(literal) == tuple(table)
+
+
+def test_words_of_other_programs_are_answered():
+    words = {"EFFL": "effective_focal_length", "totr": "total_track", "MNCA": "air_centre"}
+    for word, kind in (words | {"OAL": "length", "RSCH": "spot_chief"}).items():
+        with pytest.raises(ValueError, match=f"got '{word}'; did you mean '{kind}'"):
+            Operand(word)
+    assert {*operands._ELSEWHERE.values()} <= {*design.OPERANDS}

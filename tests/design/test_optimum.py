@@ -190,6 +190,22 @@ def test_limits_are_kept_where_trials_are_used_up(triplet):
     assert float(found.lens.sensor) <= 55 and found.merit < 2 * found.history[-1, 0]
 
 
+def test_limits_that_are_met_in_the_end_are_not_why_it_ended():
+    """Of a light limit the multipliers have not settled after 30 rounds: by 1 / (1 + w^2) each; the
+    last steps mend it. Of two that contradict each other, nothing does."""
+    lens = drt_jax.load_lens("singlet")
+    variables = Variables.from_lens(lens, ["sensor"])
+    length = float(lens.sensor)
+    asked = [Operand("total_track", length + 0.05), Operand("total_track", high=length, weight=0.7)]
+    found = design.optimise(design.Problem.from_variables(variables, asked))
+    assert 1e-8 < found.history[-1, 1] < 1e-3 and found.max_violation <= 0
+    assert found.ended == "converged" and found.converged
+    np.testing.assert_allclose(found.lens.sensor, length, atol=1e-8)
+    low = Operand("total_track", low=length + 1e-4)
+    found = design.optimise(design.Problem.from_variables(variables, [*asked, low]))
+    assert found.max_violation > 1e-5 and found.ended == "limits"
+
+
 @pytest.mark.slow
 def test_an_optimum_says_whether_it_converged_and_names_its_limits(triplet):
     """Of limits that cannot be kept together, the worst one by kind, surface, zone and amount."""

@@ -69,7 +69,7 @@ def test_other_numbers_and_names_compile_nothing(caplog):
         found = searched(2)[1]
     compiled = [r.getMessage() for r in caplog.records if "ompil" in r.getMessage()]
     assert not compiled, compiled[:3]
-    assert np.isfinite(found.merit) and found.lens.name == "three"
+    assert np.isfinite(found.merit) and found.lens.name == "three, re-optimised"
     assert found.lens.glasses == ("air", "SK16", "air", "air", "SF2", "air")
     focal = drt_jax.focal_length(found.lens, 0.5875618)
     np.testing.assert_allclose(focal, 62, rtol=1e-12)

@@ -229,7 +229,7 @@ def test_grades_are_tolerances_of_a_lens():
 @pytest.mark.parametrize(
     "compensator, told",
     [
-        ([("sensor", 1.0)], "^compensator: expected none, focus, focus and tilt or a list of Tol"),
+        ([("sensor", 1.0)], "^compensator: .* common focus, focus and tilt or a list of Tol"),
         ([Tolerance("thickness", 1.0, (7,))], "thickness: no surface 7 can deviate; there are 0"),
         (Assembly("focus", "spots"), "^operands: kind: expected one of spot"),
         (Assembly("focus", Operand("spot", fields=(5,))), "fields: no number 5; there are 0, 1"),

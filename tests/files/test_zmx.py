@@ -588,9 +588,9 @@ SENSOR = {"sensor_tilt": [1, 0.5, 0], "sensor_decentre": [0.2, 0.1]}
 
 
 def assert_same(one, two):
-    """Two lenses, but for their names, to 17 digits; model glasses to the last digits of nd."""
+    """Two lenses, but for their names, to the last bit; model glasses to the last digits of nd."""
     for key in ("curvature", "conic", "thickness", "semi_diameter", "sensor"):
-        np.testing.assert_array_equal(getattr(one, key), getattr(two, key))
+        np.testing.assert_array_max_ulp(np.asarray(getattr(one, key)), getattr(two, key), 1)
     width = one.coefficients.shape[1]
     np.testing.assert_allclose(two.coefficients[:, :width], one.coefficients, rtol=3e-16)
     assert not np.any(two.coefficients[:, width:])
@@ -679,7 +679,7 @@ def test_written_series_and_phases(tmp_path):
     save_lens(lens, tmp_path / "own.zmx")
     again = load_lens(tmp_path / "own.zmx")
     assert_same(lens, again)
-    np.testing.assert_array_equal(lens.phase.coefficients, again.phase.coefficients)
+    np.testing.assert_allclose(lens.phase.coefficients, again.phase.coefficients, rtol=3e-16)
     assert again.phase.order.tolist() == [-1]
     linear = 0.1 * 1 / 4 - 0.2 * 2 / 4 + 0.3 * 1 / 16 - (50 - np.sqrt(50**2 - 5))
     np.testing.assert_allclose(sag(again, 1, 1.0, 2.0), linear)

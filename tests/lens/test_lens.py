@@ -111,7 +111,7 @@ def test_a_lens_prints_shortly():
     lens, said = load_lens("double_gauss"), []
     gradient = jax.grad(lambda lens: lens.sensor**2)(lens)
     jax.jit(lambda lens: said.append(repr(lens)))(lens)
-    what = f"Lens({lens.name!r}: 11 surfaces, the stop is number 5"
+    what = f"Lens({lens.name!r}: 11 surfaces, stop: surface 5"
     assert repr(lens) == f"{what}, sensor 133.35, float64)"
     assert repr(gradient) == f"{what}, sensor 266.7, float64)"
     assert said == [f"{what}, float64)".replace(lens.name, "")]

@@ -113,11 +113,11 @@ def test_fans_have_one_scale_with_symbols_and_units():
     show.fan(axes, fans, 0, (0.5, 0.6), half=20.0)
     np.testing.assert_allclose(axes.lines[1].get_ydata(), 1e3 * errors[0, 1, :, 1])
     assert axes.get_ylim() == (-20, 20) and axes.get_ylabel() == "ray error $e_y$ (um)"
-    assert axes.get_xlabel() == "stop $P_y$"
+    assert axes.get_xlabel() == "pupil $P_y$"
     _, axes = show.new()
     show.path_fan(axes, fans, 0, (0.5, 0.6), sagittal=True)
     np.testing.assert_allclose(axes.lines[0].get_ydata(), 2 * errors[0, 0, :, 0])
-    assert axes.get_ylabel() == "OPD along x (waves)" and axes.get_xlabel() == "stop $P_x$"
+    assert axes.get_ylabel() == "OPD along x (waves)" and axes.get_xlabel() == "pupil $P_x$"
 
 
 def test_bars_are_third_order_aberrations_of_each_surface_and_their_sum():
