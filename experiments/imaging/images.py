@@ -31,8 +31,9 @@ from drt_jax import Lens, Sampling, Scene, show
 from drt_jax.compilation import LARGE, known_options
 from drt_jax.image.psf import difference
 
-from . import _command, _common, _peers, _plots, _psf_peers, _work, render
+from . import _command, _common, _plots, _psf_peers, _work, render
 from ._common import Colours, not_empty, odd, within
+from ._psf_peers import Shot
 from .runs.folder import Run
 
 MODELS = "gaussian", "rays", "waves"
@@ -97,33 +98,6 @@ class Config:
     repeats: Annotated[int, within(1, 1000)] = 15
 
 
-@dataclasses.dataclass(frozen=True)
-class Shot:
-    """A view in radians and mm, on pixels."""
-
-    lens: Lens
-    field: float
-    pixel: float
-    waves: np.ndarray
-    size: int
-
-    @property
-    def scene(self) -> Scene:
-        """The object point, at infinity."""
-        return Scene.point(self.field, math.inf, self.waves)
-
-    def model(self, kind: Any, tolerance: float = 1e-2) -> Sampling:
-        """The model of a kind converged to the tolerance."""
-        return drt_jax.converge(
-            drt_jax.psf, self.lens, self.scene, self.pixel, self.size, kind, tolerance
-        )
-
-    def kernel(self, lens: Lens, model: Sampling, centre: Any = None) -> jax.Array:
-        """The kernel (W, size, size) of a lens."""
-        pixels = self.pixel, self.size
-        return drt_jax.psf(lens, self.scene, *pixels, sampling=model, centre=centre).kernel
-
-
 def histogram(shot: Shot, rounds: int, centre: np.ndarray) -> tuple[np.ndarray, float, int]:
     """Histogram (W, size, size) of traced rays on pixels about `centre` (2,), mm, its noise (from
     its two halves), and the smallest number of rays of a wavelength that arrive."""
@@ -149,7 +123,7 @@ def measure(config: Config, view: View) -> dict[str, Any]:
     """Time and error of every model, and of the peers, at one view."""
     lens = drt_jax.load_lens(view.lens)
     field, pixel = math.radians(view.field_deg), 1e-3 * view.pixel_um
-    shot = Shot(lens, field, pixel, np.array(config.wavelengths_um), config.size)
+    shot = Shot(lens, field, np.array(config.wavelengths_um), pixel, config.size)
     rule = shot.model("waves", 1e-3).rule
     limit = Sampling("waves", rule, config.limit)
     finest = drt_jax.psf(lens, shot.scene, pixel, config.size, sampling=limit)
@@ -207,20 +181,16 @@ def contrast(config: Config, lens: Lens, field: float, pixel: float) -> tuple[li
 
 def _peer_rows(config: Config, shot: Shot, rule: Any, name: dict[str, Any]) -> list[dict]:
     """Rows of other programs, at the middle wavelength."""
-    middle = shot.waves[[len(shot.waves) // 2]]
-    one = dataclasses.replace(shot, waves=middle)
-    chief = np.ravel(drt_jax.image_point(shot.lens, Scene.point(shot.field, math.inf, middle)))
+    one = dataclasses.replace(shot, waves=shot.waves[[len(shot.waves) // 2]])
+    chief = np.ravel(drt_jax.image_point(one.lens, one.scene))
     limit = Sampling("waves", rule, config.limit)
 
     def optiland(count: int) -> tuple[Callable, Any]:
-        numbers = _peers.Lens(shot.lens, shot.field, math.inf, middle)
-        call = _psf_peers.optiland(numbers, shot.pixel, shot.size, count, 4 * count)
-        return call, one.kernel(one.lens, limit, chief)[0]
+        return _psf_peers.optiland(one, count), one.kernel(one.lens, limit, chief)[0]
 
     def prysm(count: int) -> tuple[Callable, Any]:
-        pupil, step, centre = _psf_peers.pupil(shot.lens, shot.field, middle, rule, count)
-        call = _psf_peers.prysm(pupil, step, middle[0], shot.pixel, shot.size)
-        return call, one.kernel(one.lens, limit, centre)[0]
+        *given, centre = _psf_peers.pupil(one, rule, count)
+        return _psf_peers.prysm(one, *given), one.kernel(one.lens, limit, centre)[0]
 
     rows = []
     for program, make in (("optiland", optiland), ("prysm", prysm)):

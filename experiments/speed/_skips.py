@@ -16,10 +16,9 @@ import numpy as np
 from jax import Array
 
 import drt_jax
-from drt_jax import Clipped, Lens, Pattern, Scene, learn, pupil
+from drt_jax import Clipped, Lens, Pattern, Scene, design, learn, pupil
 from drt_jax.compilation import LARGE, known_options
 from drt_jax.image.moments import moments
-from drt_jax.lens.edit import reindexed
 from drt_jax.lens.lens import Labels
 from drt_jax.pupil import PupilRule, pupil_points
 from drt_jax.rays.solve import solve, solve_aimed
@@ -177,11 +176,10 @@ def quadrature(config: Any) -> list[Way]:
 
 def with_planes(lens: Lens, count: int) -> Lens:
     """The lens with planes in front of the sensor, between which nothing changes."""
-    last = lens.count - 1
-    step = (lens.sensor - lens.vertices[last]) / (count + 1)
-    rows = [*range(lens.count), *[-1] * count, lens.count]
-    media = [*range(lens.count), *[lens.count] * (count + 1)]
-    return reindexed(lens, rows, media, jnp.append(lens.thickness, jnp.full(count, step)))
+    step = (lens.sensor - lens.vertices[lens.count - 1]) / (count + 1)
+    for _ in range(count):
+        lens = design.with_dummy(lens, lens.count - 1, step)
+    return lens
 
 
 def all_traced(lens: Lens) -> Lens:
@@ -202,13 +200,15 @@ def dead(config: Any) -> list[Way]:
 
 def aimed(config: Any) -> list[Way]:
     """Rays by aiming alone, or with the search for those that are missing."""
-    at, rays = view(config, False), view(config, False).rays(view(config, False).rule)
+    at = view(config, False)
 
-    def by(solver: Callable) -> Callable:
-        return lambda lens: moments(lens, at.scene, at.rule, solver).at(lens.sensor)
+    def by(solver: Callable) -> Way:
+        def found(lens: Lens) -> Any:
+            return moments(lens, at.scene, at.rule, solver).at(lens.sensor)
 
-    ways = {"solve_aimed": solve_aimed, "solve": solve}
-    return [program(name, at.error, by(way), at.lens, rays=rays) for name, way in ways.items()]
+        return program(solver.__name__, at.error, found, at.lens, rays=at.rays(at.rule))
+
+    return [by(solve_aimed), by(solve)]
 
 
 def derivatives(config: Any, forward: bool) -> list[Way]:
@@ -241,6 +241,9 @@ def derivatives(config: Any, forward: bool) -> list[Way]:
 
     ways = {"by one thickness": one, "by the whole lens": every}
     return [program(name, error, way, at.lens) for name, way in ways.items()]
+
+
+reverse, forward = (partial(derivatives, forward=way) for way in (False, True))
 
 
 def sensors(config: Any) -> list[Way]:
