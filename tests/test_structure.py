@@ -57,7 +57,7 @@ ROOMS = {
     "drt_jax/rays": 1314,
     "drt_jax/show": 1255,
     "experiments": 488,
-    "experiments/designing": 914,
+    "experiments/designing": 905,
     "experiments/imaging": 458,
     "experiments/paper": 608,
     "experiments/runs": 453,

@@ -71,10 +71,9 @@ def row_of(config: Config, lens: drt_jax.Lens, mount: Mount, celsius: float) -> 
     model = design.ThermalModel.from_lens(lens, mount.expansion)
     hot = design.at_temperature(lens, celsius, model)
     moved = focused(config, hot, scene)
-    points = [scene.at(field) for field in np.asarray(scene.field)]
     middle = config.wavelengths_um[len(config.wavelengths_um) // 2]
     spots = {
-        name: [_common.spot_um(own, point, config.tolerance)[0] for point in points]
+        name: _common.spots_um(own, scene, config.tolerance)
         for name, own in (("spots_um", hot), ("refocused_um", moved))
     }
     shift = 1e3 * float(moved.sensor - hot.sensor)

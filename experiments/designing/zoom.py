@@ -112,13 +112,6 @@ def searched(config: Config, zoom: design.Configurations, run: Run, job: str) ->
     }
 
 
-def spots_um(config: Config, lens: drt_jax.Lens, scene: Scene) -> list[float]:
-    """RMS radii of the spots of all fields about the centroid of all wavelengths."""
-    weights = None if scene.wavelength_weights is None else np.asarray(scene.wavelength_weights)
-    points = (scene.at(field) for field in np.asarray(scene.field))
-    return [_common.spot_um(lens, point, config.tolerance, weights)[0] for point in points]
-
-
 def focusing(systems: list[System], lenses: Sequence[drt_jax.Lens]) -> design.Focusing:
     """Magnification, and breathing where the largest field of the first configuration is imaged."""
     scene, wave = systems[0].scene, systems[0].wavelengths[systems[0].primary]
@@ -151,7 +144,7 @@ def run(config: Config, run: Run) -> dict[str, Any]:
     for name, some in lenses.items():
         for row, system, lens in zip(rows, systems, some, strict=True):
             drt_jax.save_lens(lens, run.folder / f"{name}_{row['configuration']}.yaml")
-            row[f"spots_um_{name}"] = spots_um(config, lens, system.scene)
+            row[f"spots_um_{name}"] = _common.spots_um(lens, system.scene, config.tolerance)
             wave = system.wavelengths[system.primary :][:1]
             focal = drt_jax.first_order(lens, system.distance, wave).effective_focal_length
             row[f"focal_mm_{name}"] = float(focal[0])
