@@ -67,7 +67,9 @@ def run(config: Any, run: Run) -> dict[str, Any]:
     some = np.unique(np.linspace(0, len(angles) - 1, _SHOWN).astype(int))
     pictures = {}
     for arm in arms:
-        images = _pictures(setup, imager, trained[arm, 0])
+        patches = _one_each(setup, _training.textured(setup.patches.test, len(angles)))
+        given = trained[arm, 0], patches, setup.judged, setup.noise, 0
+        images = _training.images(imager, *given)
         pictures |= {f"{arm} {name}": array[some] for name, array in images.items()}
     builds = _as_built(setup, run, trained, test.get("others")) if config.judge.builds else []
     return {
@@ -189,13 +191,6 @@ def _judged(
 def _one_each(setup: Setup, patches: np.ndarray) -> np.ndarray:
     """A patch for each point of the judge; patches are repeated if they are too few."""
     return np.resize(patches, (len(setup.judged.fields), *patches.shape[1:]))
-
-
-def _pictures(setup: Setup, imager: Callable, parameters: Any) -> dict[str, np.ndarray]:
-    """Images of the judge, a patch for each of its points."""
-    some = _training.textured(setup.patches.test, len(setup.judged.fields))
-    given = _one_each(setup, some), setup.judged, setup.noise, 0
-    return _training.images(imager, parameters, *given)
 
 
 def _photograph(

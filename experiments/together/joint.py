@@ -29,7 +29,7 @@ from drt_jax.design import Operand, Solve, Tie, Tolerance, Vary
 from drt_jax.learn.data import DataConfig
 
 from . import _command, _common, _plots, _report, _settings, _sharing
-from ._common import Colours, different, near_and_far, not_empty, odd, within
+from ._common import Colours, different, near_and_far, not_empty, odd, or_zero, within
 from ._setup import ARMS
 from ._train_arms import run as run
 from .runs.folder import Run as Run
@@ -161,7 +161,7 @@ class Config:
     camera: Camera = Camera()
     noise: Annotated[float, within(0, 10)] = 0.01
     shot: Annotated[float, within(0, 10)] = 0.0
-    taps: Annotated[int, within(0, 63)] = 0
+    taps: Annotated[int, within(0, 63), or_zero(odd)] = 0
     mtf_at: Annotated[float, within(1e-3, 1e4)] = 30.0
     network: _settings.Net = _settings.Net()
     train: Training = Training()
@@ -191,7 +191,6 @@ class Config:
         _common.require(fits, "camera.kernel: expected at most 63 pixels where there are taps")
         solved = not self.stops or "entrance_pupil" in {solve.kind for solve in self.solves}
         _common.require(solved, "stops: needs the solve entrance_pupil")
-        _common.require(self.taps % 2 or not self.taps, "taps: expected an odd number, or 0")
         asked = self.map.noise or self.map.near_m or self.map.plates
         mapped = not asked or (self.taps and self.stops)
         _common.require(bool(mapped), "map: needs taps above 0 and stops")

@@ -226,9 +226,7 @@ def measure(config: Config, scene: AccuracyScene) -> dict[str, list[dict]]:
     ]
     tolerances = []
     for tolerance in config.tolerances:
-        row = dict.fromkeys(("tolerance", "order", "rays", "relative_error")) | {
-            "tolerance": tolerance
-        }
+        row = {"tolerance": tolerance, "order": None, "rays": None, "relative_error": None}
         tolerances.append(row)
         try:
             rule = drt_jax.converge(drt_jax.psf_moments, *arguments, tolerance)
@@ -307,12 +305,11 @@ def draw(results: dict[str, Any], figures: pathlib.Path) -> None:
         ("rays_error", "rays", "relative_error", "rays a colour", "σ"),
         ("gradient_error", "rays", "gradient_error", "rays a colour", "dσ"),
     ):
-        figure, axes = _common.panels(len(groups), 5.2, 3.9)
-        for ax, ((panel,), rows) in zip(axes, groups.items()):
-            draw_panel(ax, rows, x, y, (xlabel, f"error of {ylabel}, relative"))
-            count = len(grouped(rows, "scene"))
-            ax.set_title(f"{panel}, {count} scene{'s' * (count != 1)}", fontsize=10)
-        figure.savefig(figures / f"{name}.png")
+        with _plots.picture(figures / f"{name}.png", 5.2, 3.9, len(groups)) as axes:
+            for ax, ((panel,), rows) in zip(axes, groups.items()):
+                draw_panel(ax, rows, x, y, (xlabel, f"error of {ylabel}, relative"))
+                count = len(grouped(rows, "scene"))
+                ax.set_title(f"{panel}, {count} scene{'s' * (count != 1)}", fontsize=10)
     keys = "reference_error", "reference_gradient_error"
     error, slope = (max(row[key] for row in results["truth"]) for key in keys)
     print(f"\nerrors of the reference, at most: values {error:.0e}, gradients {slope:.0e}")

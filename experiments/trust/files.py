@@ -25,7 +25,6 @@ from typing import Any
 import numpy as np
 
 import drt_jax
-from drt_jax import show
 
 from . import _command, _common, _plots
 from .runs.folder import Run
@@ -222,11 +221,6 @@ def counts(rows: list[dict[str, Any]], reader: str) -> list[int]:
     return [own.count(name) for name in OUTCOMES]
 
 
-def _cell(row: dict[str, Any]) -> str:
-    wrong = row["outcome"] in ("near", "wrong") and row["off"] is not None
-    return f"{row['outcome']} ({row['off']:.0e})" if wrong else row["outcome"]
-
-
 def tables(results: dict[str, Any]) -> dict[str, str]:
     """Tables of outcomes by file and program, and of their numbers. `why` is our message, else the
     error of another program."""
@@ -234,7 +228,11 @@ def tables(results: dict[str, Any]) -> dict[str, str]:
     for (name,), group in _common.grouped(results["rows"], "file").items():
         errors = [f"{row['reader']}: {row['why']}" for row in group if row["outcome"] == "wrong"]
         why = [group[0]["why"]] if group[0]["why"] else errors[:1]
-        rows.append([name, *map(_cell, group), "".join(why)])
+        cells = []
+        for row in group:
+            wrong = row["outcome"] in ("near", "wrong") and row["off"] is not None
+            cells.append(row["outcome"] + (f" ({row['off']:.0e})" if wrong else ""))
+        rows.append([name, *cells, "".join(why)])
     totals = [[reader, *counts(results["rows"], reader)] for reader in READERS]
     again = [row["trips"] | {"file": row["file"]} for row in results["rows"] if "trips" in row]
     written = []
@@ -250,10 +248,9 @@ def tables(results: dict[str, Any]) -> dict[str, str]:
 
 def draw(results: dict[str, Any], figures: pathlib.Path) -> None:
     """Draws the number of files of each outcome."""
-    figure, axes = show.new(1, 1, 8, 2.4)
     shares = {reader: counts(results["rows"], reader) for reader in READERS}
-    _plots.shares(axes, shares, OUTCOMES)
-    figure.savefig(figures / "files.png")
+    with _plots.picture(figures / "files.png", 8, 2.4) as (axes,):
+        _plots.shares(axes, shares, OUTCOMES)
 
 
 if __name__ == "__main__":
