@@ -61,7 +61,7 @@ ROOMS = {
     "experiments/imaging": 458,
     "experiments/paper": 604,
     "experiments/runs": 443,
-    "experiments/speed": 1392,
+    "experiments/speed": 1369,
     "experiments/together": 718,
     "experiments/trust": 1984,
 }

@@ -202,9 +202,7 @@ def from_file(path: pathlib.Path, parts: Sequence[float]) -> list[At]:
 
 def jobs(sizes: Profile) -> dict[str, Callable]:
     """What measures each lens, by name."""
-    makers: dict[str, Callable] = {
-        of.lens: partial(bundled, of, sizes.parts) for of in sizes.lenses
-    }
+    makers = {of.lens: partial(bundled, of, sizes.parts) for of in sizes.lenses}
     folder = sizes.files and pathlib.Path(sizes.files)
     for path in sorted(folder.glob("*.zmx")) if folder and folder.is_dir() else ():
         makers[path.name] = partial(from_file, path, sizes.parts)

@@ -75,11 +75,11 @@ class View(NamedTuple):
         return relative_error(self.truth, sigmas(found))
 
 
-def once(make: Callable[[], Any]) -> tuple[Any, float]:
+def once(make: Callable, *given: Any) -> tuple[Any, float]:
     """What is made before the calls, and the seconds for it when its programs are compiled."""
-    make()
+    make(*given)
     began = time.perf_counter()
-    return jax.block_until_ready(make()), time.perf_counter() - began
+    return jax.block_until_ready(make(*given)), time.perf_counter() - began
 
 
 def program(
@@ -101,7 +101,7 @@ def view(config: Any, on_axis: bool) -> View:
     lens, distance = drt_jax.load_lens(config.lens), 1e3 * config.distance_m
     field = 0.0 if on_axis else math.radians(config.field_deg)
     scene = Scene.point(field, distance, config.wavelengths_um)
-    rule, seconds = once(lambda: drt_jax.converge(drt_jax.psf_moments, lens, scene, config.to))
+    rule, seconds = once(drt_jax.converge, drt_jax.psf_moments, lens, scene, config.to)
     truth = _reference.reference(lens, field, distance, config.wavelengths_um)
     return View(lens, scene, rule, seconds, truth)
 
@@ -253,9 +253,8 @@ def sensors(config: Any) -> list[Way]:
     places = at.lens.sensor + jnp.linspace(-reach, reach, _POSITIONS)
     moved = [dataclasses.replace(at.lens, sensor=places[k]) for k in (0, -1)]
     true = [_true(config, lens, 1e3 * config.distance_m) for lens in moved]
-    rule, seconds = once(
-        lambda: drt_jax.converge(drt_jax.focus_moments, at.lens, at.scene, config.to)
-    )
+    given = drt_jax.focus_moments, at.lens, at.scene, config.to
+    rule, seconds = once(drt_jax.converge, *given)
     rays = at.rays(rule)
 
     def error(found: Array) -> float:
@@ -299,8 +298,7 @@ def depths(config: Any) -> list[Way]:
     far = 1 / np.linspace(1 / ends[0], 1 / ends[1], _POSITIONS)
     scene = Scene.point(math.radians(config.field_deg), ends, config.wavelengths_um)
     true = [_true(config, at.lens, distance) for distance in far[[0, 1]]]
-    model = partial(learn.moments_model, at.lens, ("sensor",), scene, config.to)
-    (values, blur), seconds = once(model)
+    (values, blur), seconds = once(learn.moments_model, at.lens, ("sensor",), scene, config.to)
     rule = drt_jax.converge(drt_jax.psf_moments, at.lens, scene, config.to)
 
     def error(found: Array) -> float:
@@ -316,8 +314,8 @@ def depths(config: Any) -> list[Way]:
 
         return jax.vmap(one)(far)
 
-    rays, given = _POSITIONS * at.rays(rule), jnp.asarray(far)
+    rays, far = _POSITIONS * at.rays(rule), jnp.asarray(far)
     return [
-        program("learn.moments_model", error, polynomials, values, given, rays=0, once_s=seconds),
-        program("psf_moments for each", error, traced, at.lens, given, rays=rays),
+        program("learn.moments_model", error, polynomials, values, far, rays=0, once_s=seconds),
+        program("psf_moments for each", error, traced, at.lens, far, rays=rays),
     ]

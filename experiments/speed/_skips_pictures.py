@@ -96,11 +96,8 @@ def polynomials(config: Any) -> list[Way]:
     at = view(config, False)
     scene, pixel = dataclasses.replace(at.scene, wavelengths=at.scene.wavelengths[:1]), _pixel(at)
     truth = _kernel(at.lens, scene, pixel)
-    how, seconds = once(
-        lambda: drt_jax.converge(
-            drt_jax.psf, at.lens, scene, pixel, _SIZE, "rays", config.kernels_to
-        )
-    )
+    given = at.lens, scene, pixel, _SIZE, "rays", config.kernels_to
+    how, seconds = once(drt_jax.converge, drt_jax.psf, *given)
     points = jnp.asarray(pupil.sobol_disc(config.rays)[0])
 
     def error(found: Array) -> float:
@@ -127,12 +124,8 @@ def few_kernels(config: Any) -> list[Way]:
     line = np.linspace(-edge, edge, config.picture)
     fields = np.arctan(np.stack(np.meshgrid(line, line), -1).reshape(-1, 2))
     every = Scene.radians(fields, at.scene.distance, at.scene.wavelengths[:1])
-    how, seconds = once(
-        lambda: drt_jax.converge(
-            drt_jax.kernel_grid, at.lens, every, pixel, _SIZE, config.nodes, "rays",
-            config.kernels_to,
-        )
-    )  # fmt: skip
+    given = at.lens, every, pixel, _SIZE, config.nodes, "rays", config.kernels_to
+    how, seconds = once(drt_jax.converge, drt_jax.kernel_grid, *given)
     some = np.linspace(0, len(fields) - 1, 4).astype(int)
     points = every.each()
     truth = [_kernel(at.lens, points[k], pixel) for k in some]
@@ -147,12 +140,11 @@ def few_kernels(config: Any) -> list[Way]:
     def each(lens: Lens) -> Array:
         return drt_jax.psf(lens, every, pixel, _SIZE, sampling=how.sampling).kernel[:, 0]
 
-    nodes = how.nearest.size
+    name, traced = f"kernel_grid, {how.nearest.size} traced", how.nearest.size * few
     return [
-        program(f"kernel_grid, {nodes} traced", error, grid, at.lens, rays=nodes * few,
-                once_s=seconds),
+        program(name, error, grid, at.lens, rays=traced, once_s=seconds),
         program(f"psf of {len(fields)} pixels", error, each, at.lens, rays=len(fields) * few),
-    ]  # fmt: skip
+    ]
 
 
 def kept(config: Any) -> list[Way]:
@@ -160,10 +152,9 @@ def kept(config: Any) -> list[Way]:
     file, distance = pathlib.Path(config.lens), 1e3 * config.distance_m
     lens = str(file.resolve()) if file.is_file() else config.lens
     truth = reference(drt_jax.load_lens(lens), 0.0, distance, [0.53])
-    without, kept = (
-        Way(words, None, relative_error(truth, 2**0.5 * height), seconds=seconds)
-        for words, (height, seconds) in zip(
-            ("none", "a folder for programs"), _work.first_gradients(lens, 0.0, distance).tolist()
-        )
-    )
-    return [kept, without]
+    without, kept = _work.first_gradients(lens, 0.0, distance).tolist()
+
+    def way(words: str, height: float, seconds: float) -> Way:
+        return Way(words, None, relative_error(truth, 2**0.5 * height), seconds=seconds)
+
+    return [way("a folder for programs", *kept), way("none", *without)]

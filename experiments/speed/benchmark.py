@@ -88,8 +88,7 @@ class Config:
     @property
     def scene(self) -> tuple[Lens, float, float]:
         """Lens, field (radians) and distance (mm)."""
-        lens = drt_jax.load_lens(self.lens)
-        return lens, math.radians(self.field_deg), 1e3 * self.distance_m
+        return drt_jax.load_lens(self.lens), math.radians(self.field_deg), 1e3 * self.distance_m
 
     @property
     def bundle_trace(self) -> tuple[Callable, Array]:
@@ -142,9 +141,8 @@ def swept(
 def spot_curves(config: Config, gradient: bool) -> dict[str, Any]:
     """Curves of sigma, or of it and its Jacobian."""
     lens, *given = config.scene
-    wrong = functools.partial(
-        spot_error, reference(lens, *given, config.wavelengths_um[:1]), lens.count
-    )
+    truth = reference(lens, *given, config.wavelengths_um[:1])
+    wrong = functools.partial(spot_error, truth, lens.count)
     lens = dataclasses.replace(lens, curved=(lens.stop,))  # derivatives by every curvature
 
     def error(found: Any) -> float:
@@ -225,10 +223,8 @@ def bundle_task(config: Config) -> list[Row]:
         same["ratio"] = same["peer_s"] and same["peer_s"] / shared
         rows.append(_work.row(f"{task}, {devices} CPU devices", shared, **same))
 
-    single = [jax.tree.map(lambda a: jnp.asarray(a, jnp.float32), a) for a in (lens, waves, points)]
-    call, measured = compiled(
-        functools.partial(_work.hits, single[0], field, distance), *single[1:]
-    )
+    single, *rest = jax.tree.map(lambda a: jnp.asarray(a, jnp.float32), (lens, waves, points))
+    call, measured = compiled(functools.partial(_work.hits, single, field, distance), *rest)
     off = float(jnp.max(jnp.abs(call()[0] - spot)))
     seconds = _common.medians([call], config.repeats)[0]
     rows.append(_work.row(f"{task}, float32", seconds, ours_error=off, **measured))
@@ -353,9 +349,8 @@ def tables(results: dict[str, Any]) -> dict[str, str]:
 
     lines, before = [], None
     for row in results["rows"]:
-        seconds, compiling, theirs = (
-            _common.duration(row[key]) for key in ("ours_s", "compile_s", "peer_s")
-        )
+        keys = "ours_s", "compile_s", "peer_s"
+        seconds, compiling, theirs = (_common.duration(row[key]) for key in keys)
         ours = row["task"], seconds, error(row["ours_error"]), compiling
         peer = row["note"] or row["peer"], theirs, error(row["peer_error"])
         ratio = row["ratio"] and f"{row['ratio']:.3g}"

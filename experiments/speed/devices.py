@@ -63,11 +63,9 @@ def run(config: Config, run: Run) -> dict[str, Any]:
         """Function that takes a step with the images of `count` devices and returns its loss, and
         the lowered program."""
         imager = train.make_imager(blur, shared(restore, mesh, 1), train.Camera())
-        rates = {"optics": 1e-3, "network": 1e-3}
-        begin, step = train.make_step(imager, rates, (25e3, 25e3), 0)
+        begin, step = train.make_step(imager, {"optics": 1e-3, "network": 1e-3}, (25e3, 25e3), 0)
         state = [copied(mesh, begin(start))]
-        some = split(mesh, scenes[: count * config.images])
-        rest = some, np.float32(0.01), np.int32(0)
+        rest = split(mesh, scenes[: count * config.images]), np.float32(0.01), np.int32(0)
 
         def take() -> float:
             state[0], found = step(state[0], *rest)

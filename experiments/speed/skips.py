@@ -153,8 +153,7 @@ def draw(results: dict[str, Any], figures: pathlib.Path) -> None:
     """Draws bars of the factors, the largest first, and beside them the errors of both ways."""
     rows = sorted(results["rows"], key=lambda row: row["factor"])
     places = np.arange(len(rows))
-    height = 0.36 * len(rows) + 1.3
-    figure, (left, right) = show.new(1, 2, 5.6, height)
+    figure, (left, right) = show.new(1, 2, 5.6, 0.36 * len(rows) + 1.3)
     right.sharey(left)
     colours = ["C0" if row["factor"] > 1 else "0.6" for row in rows]
     left.barh(places, [row["factor"] - 1 for row in rows], 0.6, 1, color=colours)
