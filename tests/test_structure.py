@@ -57,7 +57,7 @@ ROOMS = {
     "drt_jax/rays": 1314,
     "drt_jax/show": 1255,
     "experiments": 488,
-    "experiments/designing": 905,
+    "experiments/designing": 881,
     "experiments/imaging": 458,
     "experiments/paper": 604,
     "experiments/runs": 443,

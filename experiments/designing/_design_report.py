@@ -53,11 +53,9 @@ def tables(results: dict[str, Any]) -> dict[str, str]:
     if glasses:
         header = ["behind surface", "nd", "vd", "becomes", "merit before", "after"]
         keys = ("glass", "before", "after")
-        snaps = [
-            [", ".join(map(str, s["surfaces"])), *s["model"], *map(s.get, keys)]
-            for s in glasses["snaps"]
-        ]
-        found[f"design, {name}: glasses"] = _common.table(header, snaps)
+        snaps = glasses["snaps"]
+        rows = [[", ".join(map(str, s["surfaces"])), *s["model"], *map(s.get, keys)] for s in snaps]
+        found[f"design, {name}: glasses"] = _common.table(header, rows)
     if results.get("beside"):
         found[f"design, {name}: beside"] = _peers_table(results["beside"], results["how"])
     return found

@@ -133,11 +133,9 @@ class Config:
     @property
     def scene(self) -> Scene:
         """All fields in all wavelengths, with their weights."""
-        weights = {
-            "wavelength_weights": self.colour_weights or None,
-            "field_weights": self.field_weights or None,
-        }
         fields = np.radians(self.fields_deg)
+        weights = {"wavelength_weights": self.colour_weights or None}
+        weights["field_weights"] = self.field_weights or None
         return Scene.radians(fields, self.distance_mm, self.wavelengths_um, **weights)
 
 
@@ -204,8 +202,7 @@ def grown(config: Config, problem: design.Problem, run: Run) -> drt_jax.Lens:
     while not growth.ended:
         with _Progress(f"{growth.part:.1%} of field and aperture", settings.trials) as bar:
             growth = grow_once(problem, growth, target, settings.trials, bar.searched)
-        state = growth._asdict() | {"vector": growth.vector.tolist(), "failed": None}
-        run.keep("growth", state)
+        run.keep("growth", growth._asdict() | {"vector": growth.vector.tolist(), "failed": None})
     if growth.done < 1:
         reason, failed = f"a step would be less than {SHORTEST:g}", growth.failed
         if failed is not None:
@@ -293,10 +290,9 @@ def snapped(
     given = some.makers, accept, some.count, some.steps
     with tqdm(desc="glasses", unit="glass", dynamic_ncols=True) as bar:
         snapped = design.snap_glasses(problem, found, *given, callback=lambda snap: bar.update())
-    ranked = {
-        i: [[near.glass.name, score if math.isfinite(score) else None] for near, score in own]
-        for i, own in snapped.alternatives.items()
-    }
+    ranked = {}
+    for i, own in snapped.alternatives.items():
+        ranked[i] = [[n.glass.name, score if math.isfinite(score) else None] for n, score in own]
     exchanged = {"snaps": [snap._asdict() for snap in snapped.snaps], "alternatives": ranked}
     return snapped.optimum, exchanged | {"snap_s": time.perf_counter() - begun}
 
@@ -323,10 +319,9 @@ def run(config: Config, run: Run) -> dict[str, Any]:
     """Grows, searches, finishes, and writes the lens."""
     start = drt_jax.load_lens(config.lens)
     start = design.open_apertures(start) if config.floating else start
-    require(
-        not config.glasses.makers or start.dispersion.model is not None,
-        f"glasses: {config.lens} has no model glass; give nd and vd in place of its glasses",
-    )
+    model = not config.glasses.makers or start.dispersion.model is not None
+    none = f"glasses: {config.lens} has no model glass; give nd and vd in place of its glasses"
+    require(model, none)
     first = problem_of(config, start)
     begin = grown(config, first, run) if config.growth.first < 1 else start
     problem = problem_of(config, begin)
