@@ -62,7 +62,7 @@ ROOMS = {
     "experiments/paper": 604,
     "experiments/runs": 443,
     "experiments/speed": 1369,
-    "experiments/together": 718,
+    "experiments/together": 704,
     "experiments/trust": 1984,
 }
 PUBLIC = 60

@@ -185,8 +185,7 @@ class Config:
             if begins in ("stopped", "freed") and not self.stops:
                 lacks.append("stops")
             _common.require(not lacks, f"arms: {arm} needs {' and '.join(lacks)}")
-        kinds = sorted({vary.kind for vary in self.variables})
-        _common.require_known("held", self.held, kinds)
+        _common.require_known("held", self.held, sorted({vary.kind for vary in self.variables}))
         fits = not self.taps or self.camera.kernel < 64
         _common.require(fits, "camera.kernel: expected at most 63 pixels where there are taps")
         solved = not self.stops or "entrance_pupil" in {solve.kind for solve in self.solves}
@@ -232,10 +231,9 @@ def tables(results: dict[str, Any]) -> dict[str, str]:
     if "others_psnr" in results["rows"][0]:
         header = ["arm", "PSNR dB of other photographs", "least coloured third", "most coloured"]
         names = [f"{name}_psnr" for name in ("others", "grey", "coloured")]
-        lines = [
-            [ARMS[arm].title, *(_spread([row[name] for row in own], 2) for name in names)]
-            for (arm,), own in groups.items()
-        ]
+        lines = []
+        for (arm,), own in groups.items():
+            lines.append([ARMS[arm].title, *(_spread([row[n] for row in own], 2) for n in names)])
         found[f"joint, {name}: other photographs"] = _common.table(header, lines)
     behind = results["filter_db"]
     if any(behind.values()):
