@@ -220,10 +220,7 @@ def measure(config: Config, scene: AccuracyScene) -> dict[str, list[dict]]:
     for size in (n for n in config.rays if n <= scene.most_rays):
         found = patterns(size, config.seeds, scene.dtype)
         kinds += [(name, size, rules) for name, rules in found.items()]
-    curves = [
-        {"method": name, "size": size} | row_of(arguments, truth, rules)
-        for name, size, rules in kinds
-    ]
+    curves = [{"method": n, "size": k} | row_of(arguments, truth, rules) for n, k, rules in kinds]
     tolerances = []
     for tolerance in config.tolerances:
         row = {"tolerance": tolerance, "order": None, "rays": None, "relative_error": None}
@@ -272,9 +269,8 @@ def tables(results: dict[str, Any]) -> dict[str, str]:
         cells = [panel]
         for rows in grouped(some, "tolerance").values():
             kept = [row for row in rows if row["rays"] is not None]
-            worst, most = (
-                max((row[k] for row in kept), default=0) for k in ("relative_error", "rays")
-            )
+            worst = max((row["relative_error"] for row in kept), default=0)
+            most = max((row["rays"] for row in kept), default=0)
             cells.append(f"{most}, {worst:.1e}" if len(kept) == len(rows) else "refused")
         costs.append(cells)
     first = "most rays a colour, worst error"

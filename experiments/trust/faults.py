@@ -63,8 +63,7 @@ def run(config: Config, run: Run) -> dict[str, Any]:
             return [*rows_of(config, part, pathlib.Path(folder))]
 
     jobs = {part: functools.partial(rows, part) for part in config.parts or PARTS}
-    found = _common.measured(run, "part", jobs)
-    return {"rows": sum(found, []), "seconds": run.seconds}
+    return {"rows": sum(_common.measured(run, "part", jobs), []), "seconds": run.seconds}
 
 
 def tables(results: dict[str, Any]) -> dict[str, str]:

@@ -34,12 +34,8 @@ FORMATS = (".zmx", ".seq", ".yaml")
 _NEAR = 1e-3
 _INDEX = 2e-9  # silica's constants have one digit more in some programs
 Read = tuple[list[float], list[float], float | None]
-_NUMBERS = (
-    "Effective Focal Length",
-    "Image Space F/#",
-    "Entrance Pupil Diameter",
-    "Entrance Pupil Position",
-)
+_WIDE, _PLACE = "Entrance Pupil Diameter", "Entrance Pupil Position"
+_NUMBERS = "Effective Focal Length", "Image Space F/#", _WIDE, _PLACE
 
 
 @dataclasses.dataclass(frozen=True)
@@ -82,11 +78,7 @@ def _rayoptics(path: str) -> Read:
 
 # [focal length, f-number, diameter and position of the entrance pupil], indices of all media, and
 # the distance from the object to the origin of that position; None for surface 1, as in listings.
-READERS: dict[str, Callable[[str], Read]] = {
-    "drt_jax": _ours,
-    "optiland": _optiland,
-    "rayoptics": _rayoptics,
-}
+READERS: dict[str, Callable] = {"drt_jax": _ours, "optiland": _optiland, "rayoptics": _rayoptics}
 
 
 def listed(content: str, key: str) -> tuple[float, float] | None:
@@ -115,18 +107,18 @@ def differences(
     """(relative error, whether it is right, text) of each number of a listing. Signs are not
     compared, because programs differ behind mirrors; listings write 1e10 for no focal length."""
     found = []
-    wide = (listed(content, _NUMBERS[2]) or (1.0,))[0]
+    wide = (listed(content, _WIDE) or (1.0,))[0]
     finite = re.search(r"^ OBJ\s+\S+\s+\S+\s+([-+.\dEe]+)\s", content, re.MULTILINE)
     if finite and far is not None:
         first = [*first[:3], first[3] + far - float(finite[1])]
     for key, value in zip(_NUMBERS, first):
         number, step = listed(content, key) or (value, 0.0)
-        if key != _NUMBERS[3]:
+        if key != _PLACE:
             value, number = abs(value), abs(number)
         if min(abs(value), abs(number)) >= 1e7:
             continue
         off = abs(value - number)
-        size = max(abs(number), wide if key == _NUMBERS[3] else 0.0)
+        size = max(abs(number), wide if key == _PLACE else 0.0)
         right = off <= max(1.01 * step, 1e-9 * size)
         found.append((off / size, right, f"{key} {value:.7g}, listed {number:.7g}"))
     both = indices, listed_indices(content)
