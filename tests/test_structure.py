@@ -59,7 +59,7 @@ ROOMS = {
     "experiments": 488,
     "experiments/designing": 881,
     "experiments/imaging": 458,
-    "experiments/paper": 604,
+    "experiments/paper": 599,
     "experiments/runs": 443,
     "experiments/speed": 1369,
     "experiments/together": 704,
