@@ -42,20 +42,18 @@ _ROUND = 2**17
 
 
 @dataclasses.dataclass(frozen=True)
-class View:
-    """A lens, a field angle along y, and the side of a pixel."""
-
-    lens: str
-    field_deg: Annotated[float, within(0, 89.9)]
-    pixel_um: Annotated[float, within(0.05, 1e4)]
-
-
-@dataclasses.dataclass(frozen=True)
 class Photo:
     """A lens that takes the photograph, and the side of its pixels."""
 
     lens: str
     pixel_um: Annotated[float, within(0.05, 1e4)]
+
+
+@dataclasses.dataclass(frozen=True)
+class View(Photo):
+    """With a field angle along y."""
+
+    field_deg: Annotated[float, within(0, 89.9)]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -106,8 +104,7 @@ def histogram(shot: Shot, rounds: int, centre: np.ndarray) -> tuple[np.ndarray, 
     halves = np.zeros((2, len(shot.waves), shot.size, shot.size))
     arrived = np.zeros((2, len(shot.waves)))
     for k in range(rounds):
-        some = points[k * _ROUND : (k + 1) * _ROUND]
-        rays = drt_jax.trace_rays(shot.lens, shot.scene, some)
+        rays = drt_jax.trace_rays(shot.lens, shot.scene, points[k * _ROUND : (k + 1) * _ROUND])
         arrives = np.asarray(rays.status) == drt_jax.Status.OK
         hits = np.asarray(rays.points[:, :, -1, :2]) - centre
         for w, (ok, (x, y)) in enumerate(zip(arrives, np.moveaxis(hits, -1, 1))):
@@ -225,10 +222,9 @@ def photograph(config: Config, view: Photo, figures: pathlib.Path) -> dict[str, 
     pixels = np.round(255 * picture).astype(np.uint8)
     lens, waves = drt_jax.load_lens(view.lens), np.array(config.wavelengths_um)
     ideal = render.linear(pixels)
-    method = drt_jax.converge(
-        drt_jax.render, lens, ideal.shape[:2], math.inf, 1e-3 * view.pixel_um, waves
-    )
-    call = partial(drt_jax.render, lens, ideal, math.inf, 1e-3 * view.pixel_um, waves, method)
+    seen = math.inf, 1e-3 * view.pixel_um, waves
+    method = drt_jax.converge(drt_jax.render, lens, ideal.shape[:2], *seen)
+    call = partial(drt_jax.render, lens, ideal, *seen, method)
     start = time.perf_counter()
     image = np.asarray(call())
     first = time.perf_counter() - start
@@ -317,8 +313,7 @@ def draw(results: dict[str, Any], figures: pathlib.Path) -> None:
             _plots.error_curves(above, series, "seconds", "error of the kernel (L1)")
             above.set_title(f"{view['lens']}, {view['field_deg']:g} degrees", fontsize=9)
             by_waves, by_rays, limit = np.asarray(view["transfer"])
-            curves = [by_waves, by_rays]
-            show.mtf(below, view["frequencies"], curves, limit[0], ("waves", "rays"))
+            show.mtf(below, view["frequencies"], [by_waves, by_rays], limit[0], ("waves", "rays"))
     photos = {"ideal": "ideal"} | {f"photo_{p['lens']}": p["lens"] for p in results["photographs"]}
     _plots.photographs(figures / "photographs.png", figures, photos, (3.6, 4.1))
 
