@@ -66,8 +66,7 @@ def main(experiment: Any, argv: list[str] | None = None) -> None:
     except jax.errors.JaxRuntimeError:
         if jax.process_count() == 1:
             raise
-        ended = "error: another process of the run has ended"
-        _sharing.leave(f"{ended}; {experiments.left()}", 1)
+        _sharing.leave(f"error: another process of the run has ended; {experiments.left()}", 1)
     except ValueError as error:
         raised = pathlib.Path(traceback.extract_tb(error.__traceback__)[-1].filename)
         if not any(raised.is_relative_to(ours) for ours in _OURS):
@@ -129,8 +128,7 @@ def _config(name: str, kind: type, options: argparse.Namespace, folder: pathlib.
     source = options.config or _common.CONFIGS / f"{name}.yaml"
     if options.resume and not options.config:
         source = folder / "config.yaml"
-        missing = f"{folder}: nothing to resume: no config.yaml in it"
-        _common.require(source.is_file(), missing)
+        _common.require(source.is_file(), f"{folder}: nothing to resume: no config.yaml in it")
     config = configs.load_config(kind, source, options.set)
     lens = getattr(config, "lens", "")
     known = _common.BASE / lens  # for a command that starts elsewhere

@@ -13,7 +13,7 @@ import jax
 import numpy as np
 from tqdm import tqdm
 
-from drt_jax import Lens, Scene, psf_moments, show
+from drt_jax import Lens, Scene, psf_moments
 
 from .runs.config import ConfigError
 from .runs.folder import Run
@@ -142,22 +142,25 @@ def settings(config: Any, *names: str) -> dict[str, Any]:
     return {name: list(v) if isinstance(v, tuple) else v for name, v in values.items()}
 
 
-def spot_um(
-    lens: Lens, scene: Scene, tolerance: float, weights: Sequence[float] | None = None
-) -> tuple[float, float]:
+def spot_um(lens: Lens, scene: Scene, tolerance: float) -> tuple[float, float]:
     """RMS radius of the spot of all wavelengths about their mean centroid, um, and the smallest
     throughput of a wavelength.
 
     scene: one object point.
     tolerance: relative error, which fixes the pupil rule.
-    weights: (W,), of the wavelengths; None for equal weights.
     """
     found = psf_moments(lens, scene, tolerance)
     mean, covariance = np.asarray(found.mean), np.asarray(found.covariance)
+    weights = np.asarray(scene.spectrum)
     away = mean - np.average(mean, axis=0, weights=weights)
     squares = np.trace(covariance, axis1=1, axis2=2) + np.sum(away**2, axis=1)
     radius = 1e3 * math.sqrt(np.average(squares, weights=weights))
     return radius, float(np.min(found.throughput))
+
+
+def spots_um(lens: Lens, scene: Scene, tolerance: float) -> list[float]:
+    """The radius of `spot_um` for each field of a scene."""
+    return [spot_um(lens, scene.at(field), tolerance)[0] for field in np.asarray(scene.field)]
 
 
 def measured(run: Run, unit: str, jobs: dict[str, Callable[[], Any]]) -> list[Any]:
@@ -195,15 +198,6 @@ def table(header: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
 def rings(rays: int) -> int:
     """Number of hexapolar rings of at most `rays` rays."""
     return int((math.sqrt(12 * rays - 3) - 3) / 6)
-
-
-def panels(count: int, width: float, height: float, columns: int = 2) -> tuple[Any, Any]:
-    """A figure with panels in columns, and their axes."""
-    columns = min(columns, count)
-    figure, axes = show.new(-(-count // columns), columns, width, height)
-    for spare in np.ravel(axes)[count:]:
-        spare.set_visible(False)
-    return figure, np.ravel(axes)
 
 
 def number(value: float | None, form: str) -> str:

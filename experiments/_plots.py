@@ -10,7 +10,7 @@ from matplotlib import ticker
 from matplotlib.axes import Axes
 from PIL import Image
 
-from ._common import panels
+from drt_jax import show
 
 # Errors of images are drawn so many times as large.
 GAIN = 4
@@ -26,8 +26,11 @@ def picture(
     count: number of panels.
     columns: number of panels side by side.
     """
-    figure, axes = panels(count, width, height, columns)
-    yield axes[:count]
+    columns = min(columns, count)
+    figure, axes = show.new(-(-count // columns), columns, width, height)
+    for spare in np.ravel(axes)[count:]:
+        spare.set_visible(False)
+    yield np.ravel(axes)[:count]
     figure.savefig(path)
 
 

@@ -51,18 +51,14 @@ def tables(results: dict[str, Any]) -> dict[str, str]:
         f"design, {name}": _common.table(("what", "value"), rows),
     }
     if glasses:
-        found[f"design, {name}: glasses"] = _glasses_table(glasses["snaps"])
+        header = ["behind surface", "nd", "vd", "becomes", "merit before", "after"]
+        keys = ("glass", "before", "after")
+        snaps = glasses["snaps"]
+        rows = [[", ".join(map(str, s["surfaces"])), *s["model"], *map(s.get, keys)] for s in snaps]
+        found[f"design, {name}: glasses"] = _common.table(header, rows)
     if results.get("beside"):
         found[f"design, {name}: beside"] = _peers_table(results["beside"], results["how"])
     return found
-
-
-def _glasses_table(snaps: list[dict[str, Any]]) -> str:
-    """Each glass that was exchanged in a row, with its cost."""
-    header = ["behind surface", "nd", "vd", "becomes", "merit before", "after"]
-    keys = ("glass", "before", "after")
-    rows = [[", ".join(map(str, s["surfaces"])), *s["model"], *map(s.get, keys)] for s in snaps]
-    return _common.table(header, rows)
 
 
 def _peers_table(rows: list[dict[str, Any]], how: str) -> str:

@@ -130,6 +130,14 @@ class Config:
     glasses: Glasses = Glasses()
     devices: Annotated[int, within(1, 1e4)] = dataclasses.field(default=1, compare=False)
 
+    @property
+    def scene(self) -> Scene:
+        """All fields in all wavelengths, with their weights."""
+        fields = np.radians(self.fields_deg)
+        weights = {"wavelength_weights": self.colour_weights or None}
+        weights["field_weights"] = self.field_weights or None
+        return Scene.radians(fields, self.distance_mm, self.wavelengths_um, **weights)
+
 
 def problem_of(config: Config, lens: drt_jax.Lens, order: int | None = None) -> design.Problem:
     """The problem of the settings for a lens."""
@@ -139,14 +147,10 @@ def problem_of(config: Config, lens: drt_jax.Lens, order: int | None = None) -> 
     for solve in config.solves:
         seen = waves if solve.kind == "best_focus" else middle
         solves.append(dataclasses.replace(solve, distance=config.distance_mm, wavelengths=seen))
-    weights = {
-        "wavelength_weights": config.colour_weights or None,
-        "field_weights": config.field_weights or None,
-    }
     return design.Problem.from_variables(
         design.Variables.from_lens(lens, config.variables, config.ties, solves),
         config.operands,
-        Scene.grid(np.radians(config.fields_deg), config.distance_mm, waves, **weights),
+        config.scene,
         _grid(config.rings) if config.rings else (order or config.order),
     )
 
@@ -161,22 +165,9 @@ def _grid(rings: int) -> Pattern:
     return Pattern(positions, np.full(len(positions), 1 / len(positions)), "none")
 
 
-def spots_um(config: Config, lens: drt_jax.Lens) -> list[float]:
-    """RMS radii of the spots of all fields about the centroid of all wavelengths, to the tolerance,
-    without code of drt_jax.design."""
-    weights = config.colour_weights or None
-    scenes = (
-        Scene.point(field, config.distance_mm, config.wavelengths_um)
-        for field in np.radians(config.fields_deg)
-    )
-    return [_common.spot_um(lens, scene, config.tolerance, weights)[0] for scene in scenes]
-
-
 def order_of(config: Config, lens: drt_jax.Lens) -> int:
     """The order of the pupil rule that the spots of a lens need."""
-    fields = np.radians([[0.0, field] for field in config.fields_deg])
-    scene = Scene.radians(fields, config.distance_mm, config.wavelengths_um)
-    rule = drt_jax.converge(drt_jax.psf_moments, lens, scene, config.tolerance)
+    rule = drt_jax.converge(drt_jax.psf_moments, lens, config.scene, config.tolerance)
     return getattr(rule, "order", config.order)
 
 
@@ -211,8 +202,7 @@ def grown(config: Config, problem: design.Problem, run: Run) -> drt_jax.Lens:
     while not growth.ended:
         with _Progress(f"{growth.part:.1%} of field and aperture", settings.trials) as bar:
             growth = grow_once(problem, growth, target, settings.trials, bar.searched)
-        state = growth._asdict() | {"vector": growth.vector.tolist(), "failed": None}
-        run.keep("growth", state)
+        run.keep("growth", growth._asdict() | {"vector": growth.vector.tolist(), "failed": None})
     if growth.done < 1:
         reason, failed = f"a step would be less than {SHORTEST:g}", growth.failed
         if failed is not None:
@@ -300,10 +290,9 @@ def snapped(
     given = some.makers, accept, some.count, some.steps
     with tqdm(desc="glasses", unit="glass", dynamic_ncols=True) as bar:
         snapped = design.snap_glasses(problem, found, *given, callback=lambda snap: bar.update())
-    ranked = {
-        i: [[near.glass.name, score if math.isfinite(score) else None] for near, score in own]
-        for i, own in snapped.alternatives.items()
-    }
+    ranked = {}
+    for i, own in snapped.alternatives.items():
+        ranked[i] = [[n.glass.name, score if math.isfinite(score) else None] for n, score in own]
     exchanged = {"snaps": [snap._asdict() for snap in snapped.snaps], "alternatives": ranked}
     return snapped.optimum, exchanged | {"snap_s": time.perf_counter() - begun}
 
@@ -330,10 +319,9 @@ def run(config: Config, run: Run) -> dict[str, Any]:
     """Grows, searches, finishes, and writes the lens."""
     start = drt_jax.load_lens(config.lens)
     start = design.open_apertures(start) if config.floating else start
-    require(
-        not config.glasses.makers or start.dispersion.model is not None,
-        f"glasses: {config.lens} has no model glass; give nd and vd in place of its glasses",
-    )
+    model = not config.glasses.makers or start.dispersion.model is not None
+    none = f"glasses: {config.lens} has no model glass; give nd and vd in place of its glasses"
+    require(model, none)
     first = problem_of(config, start)
     begin = grown(config, first, run) if config.growth.first < 1 else start
     problem = problem_of(config, begin)
@@ -348,13 +336,14 @@ def run(config: Config, run: Run) -> dict[str, Any]:
         lens = design.fit_apertures(problem, lens) if config.floating else lens
         drt_jax.save_lens(lens, run.folder / f"{name}.yaml")
     grew = run.kept("growth") or {"steps": 0, "jacobians": 0, "seconds": 0.0, "first": 0.0}
+    designed = drt_jax.load_lens(run.folder / "designed.yaml")
     trials = grew["steps"] + found["trials"] + len(history)
     row = {
         "problem": config.name,
         "merit_start": float(first.merit(first.variables.start)),
         "merit_end": end["merit_end"],
         "worst_limit": end["worst"],
-        "spots_um": spots_um(config, drt_jax.load_lens(run.folder / "designed.yaml")),
+        "spots_um": _common.spots_um(designed, config.scene, config.tolerance),
         "jacobians": grew["jacobians"] + found["jacobians"] + int(history[-1, 2]),
         "rays": design.rays_of(problem) * trials,
         "seconds": grew["seconds"] + found["seconds"] + end["seconds"],

@@ -22,7 +22,7 @@ from drt_jax import Scene, design, show
 
 from . import _command, _common, _plots
 from ._common import within
-from .design import Config as Design, problem_of, snapped, spots_um
+from .design import Config as Design, problem_of, snapped
 from .runs.folder import Run
 
 COLUMNS = ("merit",)
@@ -77,9 +77,7 @@ class _Search:
         self.config, self.folder = config, run.folder
         waves = config.design.wavelengths_um
         self.wave = waves[len(waves) // 2]
-
-    def problem(self, lens: drt_jax.Lens) -> design.Problem:
-        return problem_of(self.config.design, lens)
+        self.problem = functools.partial(problem_of, config.design)
 
     def kept(self, elements: int, rank: int) -> drt_jax.Lens:
         """A lens that was saved."""
@@ -89,7 +87,7 @@ class _Search:
         self, name: str, problem: design.Problem, best: design.Optimum, place: dict[str, Any]
     ) -> dict[str, Any]:
         """Saves a lens, and returns its row."""
-        lens = best.lens
+        lens, of = best.lens, self.config.design
         drt_jax.save_lens(design.fit_apertures(problem, lens), self.folder / f"{name}.yaml")
         form = form_of(lens, self.wave)
         return {
@@ -98,7 +96,7 @@ class _Search:
             "form": form,
             "merit": best.merit,
             "worst_limit": best.max_violation,
-            "spots_um": spots_um(self.config.design, lens),
+            "spots_um": _common.spots_um(lens, of.scene, of.tolerance),
             **place,
         }
 

@@ -6,12 +6,12 @@ all fields as they are, and `refocused_um` after this move.
 """
 
 import dataclasses
+import itertools
 import math
 import pathlib
 import sys
+from functools import partial
 from typing import Annotated, Any
-
-import numpy as np
 
 import drt_jax
 from drt_jax import Scene, design
@@ -71,12 +71,9 @@ def row_of(config: Config, lens: drt_jax.Lens, mount: Mount, celsius: float) -> 
     model = design.ThermalModel.from_lens(lens, mount.expansion)
     hot = design.at_temperature(lens, celsius, model)
     moved = focused(config, hot, scene)
-    points = [scene.at(field) for field in np.asarray(scene.field)]
     middle = config.wavelengths_um[len(config.wavelengths_um) // 2]
-    spots = {
-        name: [_common.spot_um(own, point, config.tolerance)[0] for point in points]
-        for name, own in (("spots_um", hot), ("refocused_um", moved))
-    }
+    spots = {"spots_um": _common.spots_um(hot, scene, config.tolerance)}
+    spots["refocused_um"] = _common.spots_um(moved, scene, config.tolerance)
     shift = 1e3 * float(moved.sensor - hot.sensor)
     focal = float(drt_jax.focal_length(hot, middle)[0])
     return {"mount": mount.name, "celsius": celsius, "focal_mm": focal, "shift_um": shift} | spots
@@ -86,27 +83,21 @@ def run(config: Config, run: Run) -> dict[str, Any]:
     """Focuses the lens at 20 C, and takes it to all temperatures in all mounts."""
     scene = Scene.degrees(config.fields_deg, config.distance_mm, config.wavelengths_um)
     lens = focused(config, drt_jax.load_lens(config.lens), scene)
-    jobs = {
-        f"{mount.name} {celsius:g}": lambda m=mount, t=celsius: row_of(config, lens, m, t)
-        for mount in config.mounts
-        for celsius in config.celsius
-    }
+    jobs = {}
+    for mount, celsius in itertools.product(config.mounts, config.celsius):
+        jobs[f"{mount.name} {celsius:g}"] = partial(row_of, config, lens, mount, celsius)
     return {"rows": _common.measured(run, "lens", jobs), **_common.settings(config, "lens")}
 
 
 def tables(results: dict[str, Any]) -> dict[str, str]:
     """Focus and spots of each mount and temperature."""
     header = ["mount", "C", "focal length, mm", "focus, um", "RMS um, not refocused", "refocused"]
-    rows = [
-        [
-            row["mount"],
-            f"{row['celsius']:g}",
-            f"{row['focal_mm']:.3f}",
-            f"{row['shift_um']:.1f}",
-            *(", ".join(f"{um:.1f}" for um in row[name]) for name in ("spots_um", "refocused_um")),
-        ]
-        for row in results["rows"]
-    ]
+    rows = []
+    for row in results["rows"]:
+        focus = f"{row['focal_mm']:.3f}", f"{row['shift_um']:.1f}"
+        both = row["spots_um"], row["refocused_um"]
+        spots = (", ".join(f"{um:.1f}" for um in some) for some in both)
+        rows.append([row["mount"], f"{row['celsius']:g}", *focus, *spots])
     return {"temperature": _common.table(header, rows)}
 
 
@@ -117,19 +108,17 @@ def draw(results: dict[str, Any], figures: pathlib.Path) -> None:
         return math.hypot(*row[key]) / math.sqrt(len(row[key]))
 
     groups = _common.grouped(results["rows"], "mount")
-    values = {"shift": {}, "spots": {}}
-    for (mount,), rows in groups.items():
-        celsius = np.array([row["celsius"] for row in rows])
-        values["shift"][mount] = celsius, np.array([row["shift_um"] for row in rows])
-        values["spots"][mount] = celsius, np.array([mean(row, "spots_um") for row in rows])
-    first, *_ = groups
-    again = np.array([mean(row, "refocused_um") for row in groups[first]])
-    styles = [{"marker": "o", "markersize": 4} for _ in groups]
     with _plots.picture(figures / "temperature.png", 4.5, 3.4, 2) as (left, right):
-        _plots.curves(left, values["shift"], "temperature (C)", "focus (um)", styles=styles)
-        values["spots"][f"{first[0]}, refocused"] = values["spots"][first[0]][0], again
-        styles.append({"color": "C0", "linestyle": "--"})
-        _plots.curves(right, values["spots"], "temperature (C)", "RMS spot (um)", styles=styles)
+        for (mount,), rows in groups.items():
+            celsius = [row["celsius"] for row in rows]
+            left.plot(celsius, [row["shift_um"] for row in rows], "o-", markersize=4, label=mount)
+            spots = [mean(row, "spots_um") for row in rows]
+            right.plot(celsius, spots, "o-", markersize=4, label=mount)
+        (mount,), rows = next(iter(groups.items()))
+        celsius, spots = zip(*((row["celsius"], mean(row, "refocused_um")) for row in rows))
+        right.plot(celsius, spots, "C0--", label=f"{mount}, refocused")
+        _plots.label_axes(left, "temperature (C)", "focus (um)")
+        _plots.label_axes(right, "temperature (C)", "RMS spot (um)")
         right.set_ylim(0, 1.1 * right.get_ylim()[1])
         right.legend(loc="lower center", fontsize=8)
 

@@ -112,13 +112,6 @@ def searched(config: Config, zoom: design.Configurations, run: Run, job: str) ->
     }
 
 
-def spots_um(config: Config, lens: drt_jax.Lens, scene: Scene) -> list[float]:
-    """RMS radii of the spots of all fields about the centroid of all wavelengths."""
-    weights = None if scene.wavelength_weights is None else np.asarray(scene.wavelength_weights)
-    points = (scene.at(field) for field in np.asarray(scene.field))
-    return [_common.spot_um(lens, point, config.tolerance, weights)[0] for point in points]
-
-
 def focusing(systems: list[System], lenses: Sequence[drt_jax.Lens]) -> design.Focusing:
     """Magnification, and breathing where the largest field of the first configuration is imaged."""
     scene, wave = systems[0].scene, systems[0].wavelengths[systems[0].primary]
@@ -135,10 +128,9 @@ def run(config: Config, run: Run) -> dict[str, Any]:
     systems = [drt_jax.load_system(config.lens, configuration=k) for k in count]
     require(len(systems) > 1, f"lens: {config.lens} has one configuration; give several")
     moved, zoom = zoom_of(config, systems, ()), zoom_of(config, systems, config.shared)
-    ends = {
-        "moved": run.once("moved", lambda: searched(config, moved, run, "moved")),
-        "designed": run.once("designed", lambda: searched(config, zoom, run, "designed")),
-    }
+    ends = {}
+    for name, problem in (("moved", moved), ("designed", zoom)):
+        ends[name] = run.once(name, lambda: searched(config, problem, run, name))
     begin = zoom.variables.start
     end = zoom.fitted(ends["designed"]["vector"], margin=1e-3)
     lenses = {"start": [system.lens for system in systems], "designed": end}
@@ -151,7 +143,7 @@ def run(config: Config, run: Run) -> dict[str, Any]:
     for name, some in lenses.items():
         for row, system, lens in zip(rows, systems, some, strict=True):
             drt_jax.save_lens(lens, run.folder / f"{name}_{row['configuration']}.yaml")
-            row[f"spots_um_{name}"] = spots_um(config, lens, system.scene)
+            row[f"spots_um_{name}"] = _common.spots_um(lens, system.scene, config.tolerance)
             wave = system.wavelengths[system.primary :][:1]
             focal = drt_jax.first_order(lens, system.distance, wave).effective_focal_length
             row[f"focal_mm_{name}"] = float(focal[0])
@@ -176,17 +168,12 @@ def tables(results: dict[str, Any]) -> dict[str, str]:
         first |= {"magnification_designed": "magnification", "breathing_designed": "breathing"}
     header = [*first.values(), "merit, mm^2, of the file", "gaps alone", "all"]
     header += ["RMS um, of the file", "all"]
-    rows = [
-        [
-            *(row[key] + 0 for key in first),  # no -0
-            *(row[f"merit_{name}"] for name in ("start", "moved", "end")),
-            *(
-                ", ".join(f"{um:.1f}" for um in row[f"spots_um_{name}"])
-                for name in ("start", "designed")
-            ),
-        ]
-        for row in results["rows"]
-    ]
+    rows = []
+    for row in results["rows"]:
+        merits = (row[f"merit_{name}"] for name in ("start", "moved", "end"))
+        both = row["spots_um_start"], row["spots_um_designed"]
+        spots = (", ".join(f"{um:.1f}" for um in some) for some in both)
+        rows.append([*(row[key] + 0 for key in first), *merits, *spots])  # no -0
     keys = ("ended", "jacobians", "seconds", "compile_s", "worst")
     searches = [[name, *map(end.get, keys)] for name, end in results["searches"].items()]
     titles = ["search", "ended", "Jacobians", "seconds", "compilation, s", "the nearest limit"]
@@ -203,8 +190,7 @@ def draw(results: dict[str, Any], figures: pathlib.Path) -> None:
     lenses, scenes, waves = [], [], results["wavelengths_um"]
     for row, name in panels:
         lenses.append(drt_jax.load_lens(figures.parent / f"{name}_{row['configuration']}.yaml"))
-        far = row["distance_mm"] or math.inf
-        scenes.append(Scene.degrees(row["fields_deg"], far, waves))
+        scenes.append(Scene.degrees(row["fields_deg"], row["distance_mm"] or math.inf, waves))
     with _plots.picture(figures / "zoom.png", 5.8, 2.5, len(panels), 2) as axes:
         for ax, (row, name) in zip(show.configurations(axes, lenses, scenes), panels):
             spot = math.hypot(*row[f"spots_um_{name}"]) / math.sqrt(len(row["fields_deg"]))

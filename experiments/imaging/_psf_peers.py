@@ -4,14 +4,18 @@ A peer returns samples of the irradiance. A pixel collects the difference, acros
 spline through their running sum.
 """
 
+import dataclasses
+import math
 from collections.abc import Callable, Sequence
+from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from scipy.interpolate import CubicSpline, RectBivariateSpline
 
 import drt_jax
-from drt_jax import Scene
+from drt_jax import Lens, Sampling, Scene
 from drt_jax.image.beam import BeamRule, centroid_and_variances, trace_beam
 from drt_jax.image.wave_psf import pupil_function
 from drt_jax.lens.scene import checked_scene
@@ -19,6 +23,50 @@ from drt_jax.lens.scene import checked_scene
 from . import _peers
 
 _UM = 1e3  # per mm
+
+
+@dataclasses.dataclass(frozen=True)
+class Shot:
+    """A kernel that all programs compute: of an object point at infinity.
+
+    field: angle along y, radians. waves: (W,), um; other programs take the first alone.
+    pixel: side of a pixel, mm. size: side of the kernel, pixels.
+    """
+
+    lens: Lens
+    field: float
+    waves: np.ndarray
+    pixel: float
+    size: int
+
+    @property
+    def scene(self) -> Scene:
+        """The object point."""
+        return Scene.point(self.field, math.inf, self.waves)
+
+    def model(self, kind: Any, tolerance: float = 1e-2) -> Sampling:
+        """Our model of a kind converged to the tolerance."""
+        given = self.lens, self.scene, self.pixel, self.size
+        return drt_jax.converge(drt_jax.psf, *given, kind, tolerance)
+
+    def kernel(self, lens: Lens, model: Sampling, centre: Any = None) -> jax.Array:
+        """Our kernel (W, size, size) of a lens."""
+        pixels = self.pixel, self.size
+        return drt_jax.psf(lens, self.scene, *pixels, sampling=model, centre=centre).kernel
+
+    def numbers(self) -> _peers.Lens:
+        """The lens for other programs."""
+        given = self.lens, self.field, math.inf, self.waves
+        return _peers.Lens(*given, _peers.flatten(self.lens)[None])
+
+    def optiland(self) -> tuple[Any, tuple[int, int], float]:
+        """Optiland's lens, field and wavelength."""
+        from optiland import backend
+
+        backend.set_backend("numpy")
+        numbers = self.numbers()
+        optic = _peers._optiland_system(numbers, numbers.index[:, 0], self.waves[0])
+        return optic, (0, 1 if self.field else 0), self.waves[0]
 
 
 def collected(
@@ -36,71 +84,63 @@ def collected(
 
 
 def pupil(
-    lens: drt_jax.Lens, field: float, wavelength: np.ndarray, rule: BeamRule, count: int,
-    centre: np.ndarray | None = None,
-) -> tuple[np.ndarray, float, np.ndarray]:  # fmt: skip
-    """The input of prysm for one wavelength (1,) and an object at infinity: the pupil function on a
-    square grid of direction cosines, the step of the grid, and the centre (2,) of the image, mm: by
-    default that of the light."""
-    scene = checked_scene(lens, Scene.point(field, np.inf, wavelength))
-    beam = trace_beam(lens, scene, rule)
+    shot: Shot, rule: BeamRule, count: int, centre: np.ndarray | None = None
+) -> tuple[np.ndarray, float, np.ndarray]:
+    """The input of prysm: the pupil function on a square grid of direction cosines, the step of the
+    grid, and the centre (2,) of the image, mm: by default that of the light."""
+    scene = checked_scene(shot.lens, dataclasses.replace(shot, waves=shot.waves[:1]).scene)
+    beam = trace_beam(shot.lens, scene, rule)
     low, high = (np.asarray(a)[:, 0] for a in beam.directions_extent())
     middle, step = (low + high) / 2, float(np.max(high - low)) / count
     grid = jnp.asarray(middle[:, None]), jnp.full((2, 1), step)
-    function = pupil_function(lens, beam, scene.wavelengths, count)
+    function = pupil_function(shot.lens, beam, scene.wavelengths, count)
     density, inside, phase = (np.asarray(a)[0] for a in function(*grid)[:3])
     if centre is None:
         centre = np.asarray(centroid_and_variances(beam.hits[:, -1], beam.weights)[0])[:, 0]
     side = (np.arange(count) - (count - 1) / 2) * step
     x, y = np.meshgrid(side, side)
-    phase = phase + 2 * np.pi * _UM / wavelength[0] * (x * centre[0] + y * centre[1])
+    phase = phase + 2 * np.pi * _UM / shot.waves[0] * (x * centre[0] + y * centre[1])
     # The exponent of prysm has the other sign.
     return np.sqrt(density) * inside * np.exp(-1j * phase), step, centre
 
 
-def optiland(numbers: _peers.Lens, pixel: float, size: int, rays: int, grid: int) -> Callable:
-    """call() -> (size, size): Optiland's FFT PSF about the chief ray at the first wavelength. rays,
-    grid: rays and samples per side."""
-    from optiland import backend
+def optiland(shot: Shot, samples: int) -> Callable:
+    """call() -> (size, size): Optiland's FFT PSF about the chief ray. samples: rays per side."""
     from optiland.psf import FFTPSF
 
-    backend.set_backend("numpy")
-    optic = _peers._optiland_system(numbers, numbers.index[:, 0], numbers.wavelengths[0])
-    field = 0, 1 if numbers.field else 0
+    given, grid = shot.optiland(), 4 * samples
 
     def call() -> np.ndarray:
-        found = FFTPSF(optic, field, numbers.wavelengths[0], num_rays=rays, grid_size=grid)
+        found = FFTPSF(*given, num_rays=samples, grid_size=grid)
         step = found._get_psf_units(found.psf)[0] / grid / _UM
-        return collected(np.asarray(found.psf), (step, step), pixel, size)
+        return collected(np.asarray(found.psf), (step, step), shot.pixel, shot.size)
 
     return call
 
 
-def optiland_contrast(numbers: _peers.Lens, samples: int, frequencies: Sequence[float]) -> Callable:
-    """call() -> (2, N): Optiland's FFT MTF at the first wavelength, tangential and sagittal, by a
-    cubic spline through its frequencies (HuygensMTF takes 2 s for 64 rays along a side, 9 s for
-    128, and is off by 0.1). samples: rays along a side. frequencies: (N,), cycles/mm."""
-    from optiland import backend
+def optiland_contrast(shot: Shot, samples: int, frequencies: Sequence[float]) -> Callable:
+    """call() -> (2, N): Optiland's FFT MTF, tangential and sagittal, by a cubic spline through its
+    frequencies (HuygensMTF takes 2 s for 64 rays along a side, 9 s for 128, and is off by 0.1).
+    samples: rays along a side. frequencies: (N,), cycles/mm."""
     from optiland.mtf import FFTMTF
 
-    backend.set_backend("numpy")
-    optic = _peers._optiland_system(numbers, numbers.index[:, 0], numbers.wavelengths[0])
-    given = optic, [(0, 1 if numbers.field else 0)], numbers.wavelengths[0]
+    optic, field, wavelength = shot.optiland()
 
     def call() -> np.ndarray:
-        found = FFTMTF(*given, num_rays=samples)
+        found = FFTMTF(optic, [field], wavelength, num_rays=samples)
         lines = zip((found.freq_tang[0], found.freq_sag[0]), found.mtf[0])
         return np.array([CubicSpline(*line)(frequencies) for line in lines])
 
     return call
 
 
-def batoid(numbers: _peers.Lens, samples: int) -> Callable:
-    """call() -> (psf, (dy, dx)): batoid's FFT PSF about the chief ray at the first wavelength, and
-    the steps of its samples, mm. samples: rays along a side."""
+def batoid(shot: Shot, samples: int) -> Callable:
+    """call() -> (psf, (dy, dx)): batoid's FFT PSF about the chief ray, and the steps of its
+    samples, mm. samples: rays along a side."""
     import batoid
     from batoid.analysis import fftPSF
 
+    numbers = shot.numbers()
     variant = numbers.variants[0]
     numbers.clear[numbers.stop] = numbers.semi  # rays of a square grid are cut by the stop
     optic = _peers._batoid_optic(numbers, variant, numbers.index[:, 0])
@@ -135,15 +175,13 @@ def contrast_of(
     return np.abs([wave @ light for wave, (light, _) in zip(waves, lines)]) / samples.sum()
 
 
-def prysm(
-    pupil: np.ndarray, step: float, wavelength: float, pixel: float, size: int, fine: int = 9
-) -> Callable:
+def prysm(shot: Shot, pupil: np.ndarray, step: float, fine: int = 9) -> Callable:
     """call() -> (size, size): prysm's matrix Fourier transform of a pupil function (N, N). step:
     step of its direction cosines. fine: samples per side of a pixel."""
     from prysm.propagation import Wavefront
 
     # At a focal length of 1 mm a direction cosine is a position in mm.
-    sample, across = pixel / fine, len(pupil)
+    sample, across, wavelength, size = shot.pixel / fine, len(pupil), shot.waves[0], shot.size
 
     def amplitude(function: np.ndarray, samples: int) -> np.ndarray:
         wave = Wavefront(function, wavelength, step)

@@ -31,8 +31,9 @@ from drt_jax import Lens, Sampling, Scene, show
 from drt_jax.compilation import LARGE, known_options
 from drt_jax.image.psf import difference
 
-from . import _command, _common, _peers, _plots, _psf_peers, _work, render
+from . import _command, _common, _plots, _psf_peers, _work, render
 from ._common import Colours, not_empty, odd, within
+from ._psf_peers import Shot
 from .runs.folder import Run
 
 MODELS = "gaussian", "rays", "waves"
@@ -41,20 +42,18 @@ _ROUND = 2**17
 
 
 @dataclasses.dataclass(frozen=True)
-class View:
-    """A lens, a field angle along y, and the side of a pixel."""
-
-    lens: str
-    field_deg: Annotated[float, within(0, 89.9)]
-    pixel_um: Annotated[float, within(0.05, 1e4)]
-
-
-@dataclasses.dataclass(frozen=True)
 class Photo:
     """A lens that takes the photograph, and the side of its pixels."""
 
     lens: str
     pixel_um: Annotated[float, within(0.05, 1e4)]
+
+
+@dataclasses.dataclass(frozen=True)
+class View(Photo):
+    """With a field angle along y."""
+
+    field_deg: Annotated[float, within(0, 89.9)]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -97,33 +96,6 @@ class Config:
     repeats: Annotated[int, within(1, 1000)] = 15
 
 
-@dataclasses.dataclass(frozen=True)
-class Shot:
-    """A view in radians and mm, on pixels."""
-
-    lens: Lens
-    field: float
-    pixel: float
-    waves: np.ndarray
-    size: int
-
-    @property
-    def scene(self) -> Scene:
-        """The object point, at infinity."""
-        return Scene.point(self.field, math.inf, self.waves)
-
-    def model(self, kind: Any, tolerance: float = 1e-2) -> Sampling:
-        """The model of a kind converged to the tolerance."""
-        return drt_jax.converge(
-            drt_jax.psf, self.lens, self.scene, self.pixel, self.size, kind, tolerance
-        )
-
-    def kernel(self, lens: Lens, model: Sampling, centre: Any = None) -> jax.Array:
-        """The kernel (W, size, size) of a lens."""
-        pixels = self.pixel, self.size
-        return drt_jax.psf(lens, self.scene, *pixels, sampling=model, centre=centre).kernel
-
-
 def histogram(shot: Shot, rounds: int, centre: np.ndarray) -> tuple[np.ndarray, float, int]:
     """Histogram (W, size, size) of traced rays on pixels about `centre` (2,), mm, its noise (from
     its two halves), and the smallest number of rays of a wavelength that arrive."""
@@ -132,8 +104,7 @@ def histogram(shot: Shot, rounds: int, centre: np.ndarray) -> tuple[np.ndarray, 
     halves = np.zeros((2, len(shot.waves), shot.size, shot.size))
     arrived = np.zeros((2, len(shot.waves)))
     for k in range(rounds):
-        some = points[k * _ROUND : (k + 1) * _ROUND]
-        rays = drt_jax.trace_rays(shot.lens, shot.scene, some)
+        rays = drt_jax.trace_rays(shot.lens, shot.scene, points[k * _ROUND : (k + 1) * _ROUND])
         arrives = np.asarray(rays.status) == drt_jax.Status.OK
         hits = np.asarray(rays.points[:, :, -1, :2]) - centre
         for w, (ok, (x, y)) in enumerate(zip(arrives, np.moveaxis(hits, -1, 1))):
@@ -149,7 +120,7 @@ def measure(config: Config, view: View) -> dict[str, Any]:
     """Time and error of every model, and of the peers, at one view."""
     lens = drt_jax.load_lens(view.lens)
     field, pixel = math.radians(view.field_deg), 1e-3 * view.pixel_um
-    shot = Shot(lens, field, pixel, np.array(config.wavelengths_um), config.size)
+    shot = Shot(lens, field, np.array(config.wavelengths_um), pixel, config.size)
     rule = shot.model("waves", 1e-3).rule
     limit = Sampling("waves", rule, config.limit)
     finest = drt_jax.psf(lens, shot.scene, pixel, config.size, sampling=limit)
@@ -207,20 +178,16 @@ def contrast(config: Config, lens: Lens, field: float, pixel: float) -> tuple[li
 
 def _peer_rows(config: Config, shot: Shot, rule: Any, name: dict[str, Any]) -> list[dict]:
     """Rows of other programs, at the middle wavelength."""
-    middle = shot.waves[[len(shot.waves) // 2]]
-    one = dataclasses.replace(shot, waves=middle)
-    chief = np.ravel(drt_jax.image_point(shot.lens, Scene.point(shot.field, math.inf, middle)))
+    one = dataclasses.replace(shot, waves=shot.waves[[len(shot.waves) // 2]])
+    chief = np.ravel(drt_jax.image_point(one.lens, one.scene))
     limit = Sampling("waves", rule, config.limit)
 
     def optiland(count: int) -> tuple[Callable, Any]:
-        numbers = _peers.Lens(shot.lens, shot.field, math.inf, middle)
-        call = _psf_peers.optiland(numbers, shot.pixel, shot.size, count, 4 * count)
-        return call, one.kernel(one.lens, limit, chief)[0]
+        return _psf_peers.optiland(one, count), one.kernel(one.lens, limit, chief)[0]
 
     def prysm(count: int) -> tuple[Callable, Any]:
-        pupil, step, centre = _psf_peers.pupil(shot.lens, shot.field, middle, rule, count)
-        call = _psf_peers.prysm(pupil, step, middle[0], shot.pixel, shot.size)
-        return call, one.kernel(one.lens, limit, centre)[0]
+        *given, centre = _psf_peers.pupil(one, rule, count)
+        return _psf_peers.prysm(one, *given), one.kernel(one.lens, limit, centre)[0]
 
     rows = []
     for program, make in (("optiland", optiland), ("prysm", prysm)):
@@ -255,10 +222,9 @@ def photograph(config: Config, view: Photo, figures: pathlib.Path) -> dict[str, 
     pixels = np.round(255 * picture).astype(np.uint8)
     lens, waves = drt_jax.load_lens(view.lens), np.array(config.wavelengths_um)
     ideal = render.linear(pixels)
-    method = drt_jax.converge(
-        drt_jax.render, lens, ideal.shape[:2], math.inf, 1e-3 * view.pixel_um, waves
-    )
-    call = partial(drt_jax.render, lens, ideal, math.inf, 1e-3 * view.pixel_um, waves, method)
+    seen = math.inf, 1e-3 * view.pixel_um, waves
+    method = drt_jax.converge(drt_jax.render, lens, ideal.shape[:2], *seen)
+    call = partial(drt_jax.render, lens, ideal, *seen, method)
     start = time.perf_counter()
     image = np.asarray(call())
     first = time.perf_counter() - start
@@ -347,8 +313,7 @@ def draw(results: dict[str, Any], figures: pathlib.Path) -> None:
             _plots.error_curves(above, series, "seconds", "error of the kernel (L1)")
             above.set_title(f"{view['lens']}, {view['field_deg']:g} degrees", fontsize=9)
             by_waves, by_rays, limit = np.asarray(view["transfer"])
-            curves = [by_waves, by_rays]
-            show.mtf(below, view["frequencies"], curves, limit[0], ("waves", "rays"))
+            show.mtf(below, view["frequencies"], [by_waves, by_rays], limit[0], ("waves", "rays"))
     photos = {"ideal": "ideal"} | {f"photo_{p['lens']}": p["lens"] for p in results["photographs"]}
     _plots.photographs(figures / "photographs.png", figures, photos, (3.6, 4.1))
 

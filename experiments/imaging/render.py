@@ -142,8 +142,7 @@ def run(config: Config, run: Run) -> dict[str, Any]:
     given = lens, shape, distance, pixel, waves, config.kernel or None, config.nodes
     method = drt_jax.converge(drt_jax.render, *given, layers=config.layers, kind=config.model)
     bar = lambda rows: tqdm(rows, unit="row", dynamic_ncols=True)  # noqa: E731
-    ideal = linear(pixels)
-    image = drt_jax.render(lens, ideal, distance, pixel, waves, method, bar)
+    image = drt_jax.render(lens, linear(pixels), distance, pixel, waves, method, bar)
     if config.full_well:
         key = jax.random.key(config.seed)
         noisy = drt_jax.sensor_noise(jnp.asarray(image), key, config.full_well, config.read_noise)

@@ -120,8 +120,7 @@ class Trained:
         `learn.moments_model`; it traces no ray if only the sensor is trained."""
         places = () if self.variables is None else self.variables.places
         leaves = tuple(sorted({"sensor", *(place.kind for place in places)}))
-        seen = scene.seen(near, far)
-        model = learn.moments_model(self.lens, leaves, seen, scene.tolerance)[1]
+        model = learn.moments_model(self.lens, leaves, scene.seen(near, far), scene.tolerance)[1]
 
         @jax.jit
         def blur(values: dict[str, Array], distance: Array) -> drt_jax.results.Moments:
@@ -144,9 +143,8 @@ class Trained:
 
         def hits(values: dict[str, Array]) -> tuple[Array, Array]:
             lens = self.lens_of(values)
-            bundle = trace_bundle(
-                lens, checked_scene(lens, scene.seen(distance)), pupil, solve_aimed
-            )
+            seen = checked_scene(lens, scene.seen(distance))
+            bundle = trace_bundle(lens, seen, pupil, solve_aimed)
             return jnp.stack([hit[-1] for hit in bundle.hits], axis=-1), bundle.status
 
         slopes, status = jax.jit(jax.jacfwd(hits, has_aux=True))(self.start(self.lens.sensor))

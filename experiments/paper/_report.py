@@ -44,11 +44,7 @@ def moves(results: dict[str, Any]) -> bool:
 
 
 def tables(
-    name: str,
-    results: dict[str, Any],
-    plane: str,
-    rows: list[tuple[str, str, str]],
-    more: str = "",
+    name: str, results: dict[str, Any], plane: str, rows: list[tuple[str, str, str]], more: str = ""
 ) -> dict[str, str]:
     """The table `name` of what the paper says and what was found here, without the paper if it has
     no such numbers; and a table of the trained numbers, if more than the sensor is trained.

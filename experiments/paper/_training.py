@@ -126,10 +126,8 @@ class Jobs:
     ) -> tuple[Callable, tuple[Callable, Callable]]:
         """The imager of a blur and its (init, step), for one job, or several at once."""
         config = self._config
-        plain, spread = (
-            train.make_imager(blur, restore, config.camera, convolve)
-            for restore in (self.restore, shared(self.restore, self._mesh, 1))
-        )
+        both = self.restore, shared(self.restore, self._mesh, 1)
+        plain, spread = (train.make_imager(blur, net, config.camera, convolve) for net in both)
         optics, setting = config.train.optics_rate, config.train
         rates: dict[str, Any] = {"optics": optics, "network": getattr(setting, "network_rate", 0.0)}
         if self._scale:

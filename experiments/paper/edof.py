@@ -133,8 +133,7 @@ def tables(results: dict[str, Any]) -> dict[str, str]:
 
 def draw(results: dict[str, Any], figures: pathlib.Path) -> None:
     """Draws the lens and figures 6a, 6b and 7."""
-    far = 1e3 * results["depth_m"][1]
-    _report.draw_lens(results, far, figures / "lens.png")
+    _report.draw_lens(results, 1e3 * results["depth_m"][1], figures / "lens.png")
     _report.draw_numbers(results, figures)
     _report.draw_sensor(results, figures / "figure_6a.png")
     labels = [f"{sensor:.2f} mm" for sensor in results["blur_sensor_mm"]]

@@ -74,28 +74,21 @@ class Run:
             stack.enter_context(locked(folder))
             for part in (folder, folder / "checkpoints"):
                 sweep(part)
-            if resume:
-                self._go_on(config)
+            saved = folder / "config.yaml"
+            if not resume:
+                if begun(folder):
+                    remedy = "add --resume to go on with it, or choose another --out"
+                    raise ConfigError(f"{folder}: holds a run already; {remedy}")
+                self._metrics.write([])
+                replace(saved, dump_config(config).encode())
+            elif load_config(type(config), saved) == config:
+                self._metrics.mend()
             else:
-                self._begin(config)
+                wrong = f"{saved}: the run to resume was started with other settings"
+                remedy = "leave out --config and --set to take its own, or choose another --out"
+                raise ConfigError(f"{wrong}; {remedy}")
             self.figures.mkdir(exist_ok=True)
             self._held = stack.pop_all()
-
-    def _begin(self, config: Any) -> None:
-        if begun(self.folder):
-            remedy = "add --resume to go on with it, or choose another --out"
-            raise ConfigError(f"{self.folder}: holds a run already; {remedy}")
-        self._metrics.write([])
-        replace(self.folder / "config.yaml", dump_config(config).encode())
-
-    def _go_on(self, config: Any) -> None:
-        saved = self.folder / "config.yaml"
-        if load_config(type(config), saved) != config:
-            raise ConfigError(
-                f"{saved}: the run to resume was started with other settings; "
-                "leave out --config and --set to take its own, or choose another --out"
-            )
-        self._metrics.mend()
 
     def close(self) -> None:
         """Unlocks the folder; nothing more may be written."""

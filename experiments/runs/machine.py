@@ -51,16 +51,10 @@ def _cpu() -> str:
 
 
 def _commit() -> str | None:
-    def git(*words: str) -> str:
-        done = subprocess.run(
-            ["git", *words], cwd=_ROOT, capture_output=True, text=True, check=True
-        )
-        return done.stdout.strip()
-
-    try:
-        if pathlib.Path(git("rev-parse", "--show-toplevel")) != _ROOT:
-            return None
-        changed = git("status", "--porcelain", "--untracked-files=no")
-        return git("rev-parse", "--short", "HEAD") + "+" * bool(changed)
-    except (OSError, subprocess.CalledProcessError):
+    if not (_ROOT / ".git").exists():
         return None
+    words = ["git", "describe", "--always", "--dirty=+", "--exclude=*"]
+    with contextlib.suppress(OSError, subprocess.CalledProcessError):
+        done = subprocess.run(words, cwd=_ROOT, capture_output=True, text=True, check=True)
+        return done.stdout.strip()
+    return None

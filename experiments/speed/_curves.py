@@ -1,7 +1,7 @@
 """Run time against error of several programs, each swept over its own samplings."""
 
 import itertools
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -15,7 +15,7 @@ from drt_jax import Lens, Scene
 from . import _common, _peers, _work
 from ._reference import changed
 
-OURS = "drt_jax"
+OURS, NODES = "drt_jax", "our nodes"
 # Errors in the table of `summary`.
 LEVELS = (1e-2, 1e-3, 1e-6)
 
@@ -44,9 +44,9 @@ def aimed(lens: Lens, scene: Scene, order: int, values: Array) -> _peers.Rays:
     return _peers.Rays(points, weights, launch=launch, free=(0, 1))
 
 
-def ways(
+def samplings(
     lens: Lens, scene: Scene, sizes: Iterable[int], orders: Iterable[int], values: Array
-) -> Iterable[tuple]:
+) -> Iterator[tuple[str, Callable]]:
     """(name, rays) of all samplings: each pattern at the paraxial pupil and at the stop, and our
     nodes, launched by us. values: of the variants of the lens."""
     for aim, where in (("paraxial", "paraxial pupil"), ("iterative", "aimed at the stop")):
@@ -54,43 +54,62 @@ def ways(
             for size in orders if kind == "Gaussian" else sizes:
                 yield f"{kind}, {where}", partial(_peers.rays_of, pattern, size, aim)
     for order in orders:
-        yield "our nodes", partial(aimed, lens, scene, order, values)
+        yield NODES, partial(aimed, lens, scene, order, values)
 
 
-def peers(
-    numbers: _peers.Lens, samplings: Iterable[tuple], error: Callable, what: Callable
-) -> tuple[list[Try], dict[str, str]]:
-    """All tries of other programs, and why there are none, by program. what: call of a program's
+def of_spots(
+    numbers: _peers.Lens, samplings: Iterable[tuple], what: Callable
+) -> Iterator[tuple[str, str, Callable]]:
+    """The ways of all programs for `tried`. samplings: of `samplings`. what: call of a program's
     `_peers.Spots`, a lens and rays."""
-    found: list[Try] = []
-    notes: dict[str, str] = {}
-    for name, rays_of in samplings:
+    for sampling, rays_of in samplings:
         for program, spots in _peers.SPOTS.items():
 
-            def make() -> tuple:
+            def make() -> tuple[int, Callable]:
                 rays = rays_of()
-                call = what(spots, numbers, rays)
-                return len(rays.weights), call, error(call())
+                return len(rays.weights), what(spots, numbers, rays)
 
-            got = _work.peer(program, make)
-            (label, content), *_ = got.items()
-            if isinstance(content, str):
-                notes.setdefault(program, content)
-                continue
-            label += ", launched by us" if name == "our nodes" else ""
-            found.append(Try(label, name, *content))
-    found_programs = {one.program.split()[0] for one in found}
-    return found, {name: why for name, why in notes.items() if name not in found_programs}
+            yield program, sampling, make
 
 
-def rows_of(task: str, tries: list[Try], repeats: int) -> list[dict[str, Any]]:
-    """Rows of results.json: `quartiles_s` of calls in turns."""
+def tried(ways: Iterable[tuple], error: Callable) -> tuple[list[Try], dict[str, str]]:
+    """All tries of other programs, and why there are none, by program.
+
+    ways: program, sampling, and a function that returns the number of rays and the call.
+    error: of what a call returns.
+    """
+    found: list[Try] = []
+    notes: dict[str, str] = {}
+    for program, sampling, make in ways:
+
+        def ready() -> tuple[int, Callable, float]:
+            size, call = make()
+            return size, call, error(call())
+
+        launched = ", launched by us" if sampling == NODES else ""
+        ((label, content),) = _work.peer(program, ready, launched).items()
+        if isinstance(content, str):
+            notes.setdefault(program, content)
+        else:
+            found.append(Try(label, sampling, *content))
+    done = {one.program.split()[0] for one in found}
+    return found, {name: why for name, why in notes.items() if name not in done}
+
+
+def rows_of(
+    task: str, ours: list[Try], ways: Iterable[tuple], error: Callable, repeats: int
+) -> dict[str, Any]:
+    """Curves of a task for results.json, with `quartiles_s` of calls in turns; and why programs
+    have none. ways, error: see `tried`."""
+    others, notes = tried(ways, error)
+    tries = [*ours, *others]
     seconds = _common.quartiles([one.call for one in tries], repeats)
-    return [
+    rows = [
         {"task": task, "program": one.program, "sampling": one.sampling, "size": one.size}
         | {"error": one.error, "quartiles_s": own, "repeats": repeats}
         for one, own in zip(tries, seconds)
     ]
+    return {"curves": rows, "missing": notes}
 
 
 def least(rows: list[dict[str, Any]], error: float) -> float:

@@ -114,14 +114,14 @@ class Lens:
         self.clear[lens.stop] = np.inf
         self.field, self.distance, self.wavelengths = field, distance, tuple(wavelengths)
         rows = shifted(lens) if values is None else values
-        self.variants = [self._variant(lens, row) for row in rows]
+        self.variants = []
+        for row in rows:
+            first = _first_order(changed(lens, row), distance, np.asarray(wavelengths))
+            curvature, thickness, sensor = np.split(np.asarray(row), [lens.count, -1])
+            gaps = np.append(thickness, sensor - np.sum(thickness))
+            entrance = tuple(float(a[0]) for a in first.entrance_pupil)
+            self.variants.append(Variant(curvature, gaps, entrance))
         self.curvature, self.gaps, self.pupil = self.variants[0]
-
-    def _variant(self, lens: drt_jax.Lens, values: Array) -> Variant:
-        first = _first_order(changed(lens, values), self.distance, np.asarray(self.wavelengths))
-        curvature, thickness, sensor = np.split(np.asarray(values), [lens.count, -1])
-        gaps = np.append(thickness, sensor - np.sum(thickness))
-        return Variant(curvature, gaps, tuple(float(a[0]) for a in first.entrance_pupil))
 
 
 def _sigma(x: Any, y: Any, weights: Any, free: tuple[int, int]) -> Any:

@@ -77,17 +77,13 @@ class Profile:
 
 
 class At(NamedTuple):
-    """A lens and an object point: field along y in radians, distance in mm, wavelength in um."""
+    """A lens and an object point, as arguments of `reference` and `_peers.Lens`: field along y in
+    radians, distance in mm, and one wavelength in um."""
 
     lens: Lens
     field: float
     distance: float
-    wavelength: float
-
-    @property
-    def given(self) -> tuple:
-        """Arguments of `reference` and `_peers.Lens`."""
-        return self.lens, self.field, self.distance, (self.wavelength,)
+    wavelengths: tuple[float]
 
 
 @jax.jit
@@ -97,24 +93,13 @@ def _sigma(lens: Lens, scene: Scene, rule: Any) -> Array:
 
 def _ours(at: At, sizes: Profile, clipped: bool, error: Callable) -> Made:
     """(call, error) of Gauss rules on the stop or, for a clipped pupil, of rules fitted to it."""
-    lens, field, distance, waves = at.given
-    scene, symmetry = Scene.point(field, distance, waves), drt_jax.pupil.symmetry_of(lens, field)
+    lens, *seen = at
+    scene, symmetry = Scene.point(*seen), drt_jax.pupil.symmetry_of(lens, at.field)
     rules: list[Any] = [Gauss(order, symmetry) for order in sizes.own_orders]
     if clipped:
         rules = [Clipped(order, symmetry, size, may_cross(lens)) for order, size in _CLIPPED]
     for rule in rules:
         call = partial(_sigma, lens, scene, rule)
-        yield call, error(call())
-
-
-def _theirs(
-    spot: Callable, numbers: Callable, way: tuple[str, str], sizes: Profile, error: Callable
-) -> Made:
-    """(call, error) of another program. numbers: makes its lens. way: where it aims, and the
-    pattern."""
-    aim, pattern = way
-    for size in sizes.orders if pattern == "Gaussian" else sizes.rays:
-        call = spot(numbers(), _peers.rays_of(_peers.PATTERNS[pattern], size, aim))
         yield call, error(call())
 
 
@@ -158,13 +143,19 @@ def rows_at(at: At, sizes: Profile) -> list[Row]:
     """A row of each program; ValueError if the reference knows no spot there."""
     if at.lens.elements or at.lens.apertures or at.lens.phase or at.lens.tilt is not None:
         raise ValueError("the reference knows centred lenses with round apertures alone")
-    truth = reference(*at.given, slopes=False)
+    truth = reference(*at, slopes=False)
     error = partial(relative_error, truth)
     work = {"drt_jax": [_ours(at, sizes, bool(truth.clipped[0]), error)]}
-    numbers = cache(partial(_peers.Lens, *at.given))
+    numbers = cache(partial(_peers.Lens, *at))
+
+    def theirs(spot: Callable, aim: str, pattern: str) -> Made:
+        for size in sizes.orders if pattern == "Gaussian" else sizes.rays:
+            call = spot(numbers(), _peers.rays_of(_peers.PATTERNS[pattern], size, aim))
+            yield call, error(call())
+
     ways = list(itertools.product(("iterative", "paraxial"), _PATTERNS))
     for name, (spot, _) in _peers.SPOTS.items():
-        work[name] = [_theirs(spot, numbers, way, sizes, error) for way in ways]
+        work[name] = [theirs(spot, *way) for way in ways]
     tried = {name: attempt(sweeps) for name, sweeps in work.items()}
     every = {id(call): call for calls, _ in tried.values() for some in calls for call in some}
     times = dict(zip(every, _common.quartiles([*every.values()], sizes.repeats)))
@@ -195,7 +186,7 @@ def of_lens(name: str, make: Callable, sizes: Profile) -> dict[str, list[Row]]:
 def bundled(of: LensFields, parts: Sequence[float]) -> list[At]:
     """Scenes of a lens: an object at infinity, at parts of the widest field."""
     lens, widest = drt_jax.load_lens(of.lens), math.radians(of.field_deg)
-    return [At(lens, part * widest, math.inf, _GREEN) for part in parts]
+    return [At(lens, part * widest, math.inf, (_GREEN,)) for part in parts]
 
 
 def from_file(path: pathlib.Path, parts: Sequence[float]) -> list[At]:
@@ -206,14 +197,12 @@ def from_file(path: pathlib.Path, parts: Sequence[float]) -> list[At]:
     widest = float(np.max(np.hypot(*np.asarray(system.fields).T)))
     fields = dict.fromkeys(part * widest for part in parts)
     wavelength = float(system.wavelengths[system.primary])
-    return [At(system.lens, field, float(system.distance), wavelength) for field in fields]
+    return [At(system.lens, field, float(system.distance), (wavelength,)) for field in fields]
 
 
 def jobs(sizes: Profile) -> dict[str, Callable]:
     """What measures each lens, by name."""
-    makers: dict[str, Callable] = {
-        of.lens: partial(bundled, of, sizes.parts) for of in sizes.lenses
-    }
+    makers = {of.lens: partial(bundled, of, sizes.parts) for of in sizes.lenses}
     folder = sizes.files and pathlib.Path(sizes.files)
     for path in sorted(folder.glob("*.zmx")) if folder and folder.is_dir() else ():
         makers[path.name] = partial(from_file, path, sizes.parts)

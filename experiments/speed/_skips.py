@@ -16,10 +16,9 @@ import numpy as np
 from jax import Array
 
 import drt_jax
-from drt_jax import Clipped, Lens, Pattern, Scene, learn, pupil
+from drt_jax import Clipped, Lens, Pattern, Scene, design, learn, pupil
 from drt_jax.compilation import LARGE, known_options
 from drt_jax.image.moments import moments
-from drt_jax.lens.edit import reindexed
 from drt_jax.lens.lens import Labels
 from drt_jax.pupil import PupilRule, pupil_points
 from drt_jax.rays.solve import solve, solve_aimed
@@ -76,11 +75,11 @@ class View(NamedTuple):
         return relative_error(self.truth, sigmas(found))
 
 
-def once(make: Callable[[], Any]) -> tuple[Any, float]:
+def once(make: Callable, *given: Any) -> tuple[Any, float]:
     """What is made before the calls, and the seconds for it when its programs are compiled."""
-    make()
+    make(*given)
     began = time.perf_counter()
-    return jax.block_until_ready(make()), time.perf_counter() - began
+    return jax.block_until_ready(make(*given)), time.perf_counter() - began
 
 
 def program(
@@ -102,7 +101,7 @@ def view(config: Any, on_axis: bool) -> View:
     lens, distance = drt_jax.load_lens(config.lens), 1e3 * config.distance_m
     field = 0.0 if on_axis else math.radians(config.field_deg)
     scene = Scene.point(field, distance, config.wavelengths_um)
-    rule, seconds = once(lambda: drt_jax.converge(drt_jax.psf_moments, lens, scene, config.to))
+    rule, seconds = once(drt_jax.converge, drt_jax.psf_moments, lens, scene, config.to)
     truth = _reference.reference(lens, field, distance, config.wavelengths_um)
     return View(lens, scene, rule, seconds, truth)
 
@@ -177,11 +176,10 @@ def quadrature(config: Any) -> list[Way]:
 
 def with_planes(lens: Lens, count: int) -> Lens:
     """The lens with planes in front of the sensor, between which nothing changes."""
-    last = lens.count - 1
-    step = (lens.sensor - lens.vertices[last]) / (count + 1)
-    rows = [*range(lens.count), *[-1] * count, lens.count]
-    media = [*range(lens.count), *[lens.count] * (count + 1)]
-    return reindexed(lens, rows, media, jnp.append(lens.thickness, jnp.full(count, step)))
+    step = (lens.sensor - lens.vertices[lens.count - 1]) / (count + 1)
+    for _ in range(count):
+        lens = design.with_dummy(lens, lens.count - 1, step)
+    return lens
 
 
 def all_traced(lens: Lens) -> Lens:
@@ -202,13 +200,15 @@ def dead(config: Any) -> list[Way]:
 
 def aimed(config: Any) -> list[Way]:
     """Rays by aiming alone, or with the search for those that are missing."""
-    at, rays = view(config, False), view(config, False).rays(view(config, False).rule)
+    at = view(config, False)
 
-    def by(solver: Callable) -> Callable:
-        return lambda lens: moments(lens, at.scene, at.rule, solver).at(lens.sensor)
+    def by(solver: Callable) -> Way:
+        def found(lens: Lens) -> Any:
+            return moments(lens, at.scene, at.rule, solver).at(lens.sensor)
 
-    ways = {"solve_aimed": solve_aimed, "solve": solve}
-    return [program(name, at.error, by(way), at.lens, rays=rays) for name, way in ways.items()]
+        return program(solver.__name__, at.error, found, at.lens, rays=at.rays(at.rule))
+
+    return [by(solve_aimed), by(solve)]
 
 
 def derivatives(config: Any, forward: bool) -> list[Way]:
@@ -243,6 +243,9 @@ def derivatives(config: Any, forward: bool) -> list[Way]:
     return [program(name, error, way, at.lens) for name, way in ways.items()]
 
 
+reverse, forward = (partial(derivatives, forward=way) for way in (False, True))
+
+
 def sensors(config: Any) -> list[Way]:
     """The spot at many places of the sensor: polynomials of one trace, or a trace for each."""
     at = view(config, False)
@@ -250,9 +253,8 @@ def sensors(config: Any) -> list[Way]:
     places = at.lens.sensor + jnp.linspace(-reach, reach, _POSITIONS)
     moved = [dataclasses.replace(at.lens, sensor=places[k]) for k in (0, -1)]
     true = [_true(config, lens, 1e3 * config.distance_m) for lens in moved]
-    rule, seconds = once(
-        lambda: drt_jax.converge(drt_jax.focus_moments, at.lens, at.scene, config.to)
-    )
+    given = drt_jax.focus_moments, at.lens, at.scene, config.to
+    rule, seconds = once(drt_jax.converge, *given)
     rays = at.rays(rule)
 
     def error(found: Array) -> float:
@@ -296,8 +298,7 @@ def depths(config: Any) -> list[Way]:
     far = 1 / np.linspace(1 / ends[0], 1 / ends[1], _POSITIONS)
     scene = Scene.point(math.radians(config.field_deg), ends, config.wavelengths_um)
     true = [_true(config, at.lens, distance) for distance in far[[0, 1]]]
-    model = partial(learn.moments_model, at.lens, ("sensor",), scene, config.to)
-    (values, blur), seconds = once(model)
+    (values, blur), seconds = once(learn.moments_model, at.lens, ("sensor",), scene, config.to)
     rule = drt_jax.converge(drt_jax.psf_moments, at.lens, scene, config.to)
 
     def error(found: Array) -> float:
@@ -313,8 +314,8 @@ def depths(config: Any) -> list[Way]:
 
         return jax.vmap(one)(far)
 
-    rays, given = _POSITIONS * at.rays(rule), jnp.asarray(far)
+    rays, far = _POSITIONS * at.rays(rule), jnp.asarray(far)
     return [
-        program("learn.moments_model", error, polynomials, values, given, rays=0, once_s=seconds),
-        program("psf_moments for each", error, traced, at.lens, given, rays=rays),
+        program("learn.moments_model", error, polynomials, values, far, rays=0, once_s=seconds),
+        program("psf_moments for each", error, traced, at.lens, far, rays=rays),
     ]

@@ -1,8 +1,8 @@
 """The pairs of calls of `skips` for kernels, pictures and programs; see `_skips`."""
 
+import dataclasses
 import math
 import pathlib
-import tempfile
 from typing import Any
 
 import jax
@@ -91,24 +91,13 @@ def separable(config: Any) -> list[Way]:
     return [program(name, error, way, *given) for name, way in ways.items()]
 
 
-def _one_colour(config: Any, fields: Any = None) -> Scene:
-    """The object point of the settings, or points at several fields (F, 2), radians, in the first
-    wavelength."""
-    field, distance = math.radians(config.field_deg), 1e3 * config.distance_m
-    make, where = (Scene.point, field) if fields is None else (Scene.radians, fields)
-    return make(where, distance, config.wavelengths_um[:1])
-
-
 def polynomials(config: Any) -> list[Way]:
     """A kernel by polynomials of the beam, or by a histogram of traced rays."""
     at = view(config, False)
-    scene, pixel = _one_colour(config), _pixel(at)
+    scene, pixel = dataclasses.replace(at.scene, wavelengths=at.scene.wavelengths[:1]), _pixel(at)
     truth = _kernel(at.lens, scene, pixel)
-    how, seconds = once(
-        lambda: drt_jax.converge(
-            drt_jax.psf, at.lens, scene, pixel, _SIZE, "rays", config.kernels_to
-        )
-    )
+    given = at.lens, scene, pixel, _SIZE, "rays", config.kernels_to
+    how, seconds = once(drt_jax.converge, drt_jax.psf, *given)
     points = jnp.asarray(pupil.sobol_disc(config.rays)[0])
 
     def error(found: Array) -> float:
@@ -134,13 +123,9 @@ def few_kernels(config: Any) -> list[Way]:
     edge = math.tan(math.radians(config.field_deg)) / math.sqrt(2)
     line = np.linspace(-edge, edge, config.picture)
     fields = np.arctan(np.stack(np.meshgrid(line, line), -1).reshape(-1, 2))
-    every = _one_colour(config, fields)
-    how, seconds = once(
-        lambda: drt_jax.converge(
-            drt_jax.kernel_grid, at.lens, every, pixel, _SIZE, config.nodes, "rays",
-            config.kernels_to,
-        )
-    )  # fmt: skip
+    every = Scene.radians(fields, at.scene.distance, at.scene.wavelengths[:1])
+    given = at.lens, every, pixel, _SIZE, config.nodes, "rays", config.kernels_to
+    how, seconds = once(drt_jax.converge, drt_jax.kernel_grid, *given)
     some = np.linspace(0, len(fields) - 1, 4).astype(int)
     points = every.each()
     truth = [_kernel(at.lens, points[k], pixel) for k in some]
@@ -155,27 +140,21 @@ def few_kernels(config: Any) -> list[Way]:
     def each(lens: Lens) -> Array:
         return drt_jax.psf(lens, every, pixel, _SIZE, sampling=how.sampling).kernel[:, 0]
 
-    nodes = how.nearest.size
+    name, traced = f"kernel_grid, {how.nearest.size} traced", how.nearest.size * few
     return [
-        program(f"kernel_grid, {nodes} traced", error, grid, at.lens, rays=nodes * few,
-                once_s=seconds),
+        program(name, error, grid, at.lens, rays=traced, once_s=seconds),
         program(f"psf of {len(fields)} pixels", error, each, at.lens, rays=len(fields) * few),
-    ]  # fmt: skip
+    ]
 
 
 def kept(config: Any) -> list[Way]:
     """The first gradient of a new process, with programs that another one kept, or without."""
     file, distance = pathlib.Path(config.lens), 1e3 * config.distance_m
     lens = str(file.resolve()) if file.is_file() else config.lens
-    compiled_s, kept_s = _work.first_seconds(lens, 0.0, distance)
-    code = _work._FIRST.format(lens=lens, field=0.0, distance=distance)
-    code += "print(float(sigma(lens)))"  # along y
-    with tempfile.TemporaryDirectory() as folder:
-        cache = {"JAX_COMPILATION_CACHE_DIR": folder}
-        found = [_work.in_a_new_process(code, cache) for _ in range(2)]
-    truth = reference(drt_jax.load_lens(config.lens), 0.0, distance, [0.53])
-    compiled, kept = (relative_error(truth, 2**0.5 * height) for height in found)
-    return [
-        Way("a folder for programs", None, kept, seconds=kept_s),
-        Way("none", None, compiled, seconds=compiled_s),
-    ]
+    truth = reference(drt_jax.load_lens(lens), 0.0, distance, [0.53])
+    without, kept = _work.first_gradients(lens, 0.0, distance).tolist()
+
+    def way(words: str, height: float, seconds: float) -> Way:
+        return Way(words, None, relative_error(truth, 2**0.5 * height), seconds=seconds)
+
+    return [way("a folder for programs", *kept), way("none", *without)]

@@ -31,7 +31,7 @@ import numpy as np
 from jax import Array
 
 import drt_jax
-from drt_jax import Lens, Scene, Status, learn, pupil, show
+from drt_jax import Lens, Scene, Status, learn, pupil
 from drt_jax.compilation import NETWORK, known_options
 from drt_jax.learn import network, train
 
@@ -88,8 +88,7 @@ class Config:
     @property
     def scene(self) -> tuple[Lens, float, float]:
         """Lens, field (radians) and distance (mm)."""
-        lens = drt_jax.load_lens(self.lens)
-        return lens, math.radians(self.field_deg), 1e3 * self.distance_m
+        return drt_jax.load_lens(self.lens), math.radians(self.field_deg), 1e3 * self.distance_m
 
     @property
     def bundle_trace(self) -> tuple[Callable, Array]:
@@ -110,82 +109,87 @@ def spot_error(truth: Moments, count: int, values: Any, slopes: Any = None) -> f
     return max(worst, wrong)
 
 
+def swept(
+    config: Config, task: str, lens: Lens, variants: Array, ours: Callable, theirs: Callable,
+    error: Callable,
+) -> dict[str, Any]:  # fmt: skip
+    """Curves of sigma at the first wavelength, and why programs have none.
+
+    variants: (V, P), numbers of the lens for other programs, see `_peers.Lens`.
+    ours: compiled call for a function from numbers (P,) to sigma.
+    theirs: call of another program, see `_curves.of_spots`.
+    error: of what a call returns.
+    """
+    _, field, distance = config.scene
+    waves, tries = config.wavelengths_um[:1], []
+    scene = Scene.point(field, distance, waves)
+    for order in config.orders:
+        rule = drt_jax.Gauss(order, "bilateral" if field else "rotational")
+
+        def sigma(values: Array) -> Array:
+            return sigmas(drt_jax.psf_moments(changed(lens, values), scene, rule))
+
+        call = ours(sigma)
+        rays = pupil.pupil_points(lens, scene, rule)[1].shape[-1]
+        tries.append(_curves.Try(_curves.OURS, _curves.NODES, rays, call, error(call())))
+    numbers = _peers.Lens(lens, field, distance, waves, variants)
+    samplings = _curves.samplings(lens, scene, config.rays, config.orders, variants)
+    ways = _curves.of_spots(numbers, samplings, theirs)
+    return _curves.rows_of(task, tries, ways, error, config.repeats)
+
+
 def spot_curves(config: Config, gradient: bool) -> dict[str, Any]:
-    """Curves of sigma at the first wavelength, or of it and its Jacobian, and why programs have
-    none."""
-    lens, field, distance = config.scene
-    waves = config.wavelengths_um[:1]
-    scene, given = Scene.point(field, distance, waves), (lens, field, distance, waves)
-    wrong = functools.partial(spot_error, reference(*given), lens.count)
+    """Curves of sigma, or of it and its Jacobian."""
+    lens, *given = config.scene
+    truth = reference(lens, *given, config.wavelengths_um[:1])
+    wrong = functools.partial(spot_error, truth, lens.count)
     lens = dataclasses.replace(lens, curved=(lens.stop,))  # derivatives by every curvature
 
     def error(found: Any) -> float:
         return wrong(*found) if gradient else wrong(found)
 
-    def ours(order: int) -> _curves.Try:
-        rule = drt_jax.Gauss(order, "bilateral" if field else "rotational")
-
-        def sigma(values):
-            return sigmas(drt_jax.psf_moments(changed(lens, values), scene, sampling=rule))
-
-        def jacobian(values):
+    def ours(sigma: Callable) -> Callable:
+        def jacobian(values: Array) -> tuple[Array, Array]:
             found, back = jax.vjp(sigma, values)
             return found, jax.vmap(lambda row: back(row)[0])(jnp.eye(found.size))
 
-        call, _ = compiled(jacobian if gradient else sigma, flatten(lens))
-        rays = pupil.pupil_points(lens, scene, rule)[1].shape[-1]
-        return _curves.Try(_curves.OURS, "our nodes", rays, call, error(call()))
+        return compiled(jacobian if gradient else sigma, flatten(lens))[0]
 
-    samplings = _curves.ways(lens, scene, config.rays, config.orders, _peers.shifted(lens))
-
-    def what(spots: _peers.Spots, *given: Any) -> Callable:
+    def theirs(spots: _peers.Spots, *given: Any) -> Callable:
         return (spots.gradient if gradient else spots.sigma)(*given)
 
-    found, notes = _curves.peers(_peers.Lens(*given), samplings, error, what)
     task = "sigma and its Jacobian" if gradient else "sigma"
-    tries = [*map(ours, config.orders), *found]
-    return {"curves": _curves.rows_of(task, tries, config.repeats), "missing": notes}
+    return swept(config, task, lens, _peers.shifted(lens), ours, theirs, error)
 
 
 def disturbed_curves(config: Config) -> dict[str, Any]:
-    """Curves of sigma of many disturbed lenses, (V, 1), at the first wavelength, and why programs
-    have none. Curvatures are off by 0.1 % and distances by 0.02 mm, one standard deviation. Other
-    programs get their lenses ready before the clock starts."""
-    lens, field, distance = config.scene
-    waves = config.wavelengths_um[:1]
-    scene, given = Scene.point(field, distance, waves), (field, distance, waves)
+    """Curves of sigma of many disturbed lenses, (V, 1). Curvatures are off by 0.1 % and distances
+    by 0.02 mm, one standard deviation. Other programs get their lenses ready before the clock
+    starts."""
+    lens, *given = config.scene
     values = flatten(lens)
     sizes = jnp.concatenate([1e-3 * values[: lens.count], jnp.full(lens.count, 0.02)])
     draw = np.random.default_rng(config.seed).normal(size=(config.disturbed, len(values)))
     values = values + sizes * draw
+    given = *given, config.wavelengths_um[:1]
     truth = [reference(changed(lens, row), *given, slopes=False) for row in values]
 
     def error(found: Any) -> float:
         return max(map(relative_error, truth, np.asarray(found)))
 
-    def ours(order: int) -> _curves.Try:
-        rule = drt_jax.Gauss(order, "bilateral" if field else "rotational")
+    def ours(sigma: Callable) -> Callable:
+        return compiled(jax.vmap(sigma), values)[0]
 
-        def sigma(row: Array) -> Array:
-            return sigmas(drt_jax.psf_moments(changed(lens, row), scene, rule))
-
-        call, _ = compiled(jax.vmap(sigma), values)
-        rays = pupil.pupil_points(lens, scene, rule)[1].shape[-1]
-        return _curves.Try(_curves.OURS, "our nodes", rays, call, error(call()))
-
-    samplings = _curves.ways(lens, scene, config.rays[:2], config.orders, values)
-    numbers = _peers.Lens(lens, *given, values)
-    found, notes = _curves.peers(numbers, samplings, error, _peers.of_all)
-    tries = [*map(ours, config.orders), *found]
+    few = dataclasses.replace(config, rays=config.rays[:2])
     task = f"sigma of {config.disturbed} disturbed lenses"
-    return {"curves": _curves.rows_of(task, tries, config.repeats), "missing": notes}
+    return swept(few, task, lens, values, ours, _peers.of_all, error)
 
 
 def waves_curves(config: Config, of: Callable) -> dict[str, Any]:
     """Curves of `_waves.kernels` or `_waves.contrasts` at the first wavelength."""
     lens, field, _ = config.scene
-    at = _waves.view(lens, field, config.wavelengths_um[0], config.waves)
-    return of(at, config.repeats)
+    at = _waves.focused(lens, field, config.wavelengths_um[0], config.waves)
+    return of(at, config.waves, config.repeats)
 
 
 def bundle_task(config: Config) -> list[Row]:
@@ -214,15 +218,13 @@ def bundle_task(config: Config) -> list[Row]:
     rows = rows_of(task, ours, error, peers, config.repeats)
     if jax.default_backend() == "cpu":
         devices = os.cpu_count() or 1
-        shared = _work.in_a_new_process(_work.SPREAD.format(config=config, devices=devices), {})
+        (shared,) = _work.in_a_new_process(_work.SPREAD.format(config=config, devices=devices), {})
         same = {key: rows[0][key] for key in ("peer", "peer_s", "peer_error", "note", "ours_error")}
         same["ratio"] = same["peer_s"] and same["peer_s"] / shared
         rows.append(_work.row(f"{task}, {devices} CPU devices", shared, **same))
 
-    single = [jax.tree.map(lambda a: jnp.asarray(a, jnp.float32), a) for a in (lens, waves, points)]
-    call, measured = compiled(
-        functools.partial(_work.hits, single[0], field, distance), *single[1:]
-    )
+    single, *rest = jax.tree.map(lambda a: jnp.asarray(a, jnp.float32), (lens, waves, points))
+    call, measured = compiled(functools.partial(_work.hits, single, field, distance), *rest)
     off = float(jnp.max(jnp.abs(call()[0] - spot)))
     seconds = _common.medians([call], config.repeats)[0]
     rows.append(_work.row(f"{task}, float32", seconds, ours_error=off, **measured))
@@ -299,8 +301,9 @@ def first_task(config: Config) -> list[Row]:
     rows = []
     for angle, where in ((0.0, "on axis"), (field, f"{config.field_deg:g} degrees")):
         task = f"first sigma and gradient in a new process, {where}"
-        compiled_s, saved_s = _work.first_seconds(config.lens, angle, distance)
-        rows += [_work.row(task, compiled_s), _work.row(f"{task}, programs kept", saved_s)]
+        seconds = _work.first_gradients(config.lens, angle, distance)[:, 1].tolist()
+        for name, own in zip((task, f"{task}, programs kept"), seconds):
+            rows.append(_work.row(name, own))
     return rows
 
 
@@ -316,9 +319,6 @@ TASKS = {
     "first": first_task,
     "profile": None,
 }
-
-
-RATES = "ours_surfaces_per_s", "peer_surfaces_per_s"
 
 
 def run(config: Config, run: Run) -> dict[str, Any]:
@@ -349,23 +349,20 @@ def tables(results: dict[str, Any]) -> dict[str, str]:
 
     lines, before = [], None
     for row in results["rows"]:
-        seconds, compiling, theirs = (
-            _common.duration(row[key]) for key in ("ours_s", "compile_s", "peer_s")
-        )
+        keys = "ours_s", "compile_s", "peer_s"
+        seconds, compiling, theirs = (_common.duration(row[key]) for key in keys)
         ours = row["task"], seconds, error(row["ours_error"]), compiling
         peer = row["note"] or row["peer"], theirs, error(row["peer_error"])
         ratio = row["ratio"] and f"{row['ratio']:.3g}"
         lines.append((*(("",) * 4 if row["task"] == before else ours), *peer, ratio))
         before = row["task"]
     header = "work", "drt_jax", "error", "to compile", "peer", "its time", "error", "ratio"
-    counts = "what a training step trains", "solves for rays"
     machine = [(_common.one_machine(results),)]
-    rates = [
-        (row["task"], *(f"{row[key] / 1e6:.3g}" if row[key] else "" for key in RATES))
-        for row in results["rows"]
-        if "ours_surfaces_per_s" in row
-    ]
-    header_of_rates = "work", "drt_jax, 1e6 rays x surfaces / s", "batoid"
+    rates = []
+    for row in results["rows"]:
+        if "ours_surfaces_per_s" in row:
+            both = (row[f"{who}_surfaces_per_s"] for who in ("ours", "peer"))
+            rates.append((row["task"], *(f"{rate / 1e6:.3g}" if rate else "" for rate in both)))
     found = {"benchmark, machine": _common.table(("machine of this run",), machine)}
     if results["curves"]:
         found["benchmark, curves"] = _curves.summary(results["curves"])
@@ -375,24 +372,24 @@ def tables(results: dict[str, Any]) -> dict[str, str]:
     if results["left_out"]:
         found["benchmark, left out"] = _profile.not_compared(results["left_out"])
     if results["rows"]:
-        found["benchmark, rates"] = _common.table(header_of_rates, rates)
+        columns = "work", "drt_jax, 1e6 rays x surfaces / s", "batoid"
+        found["benchmark, rates"] = _common.table(columns, rates)
         found["benchmark"] = _common.table(header, lines)
-        found["benchmark, counts"] = _common.table(counts, results["counts"].items())
+        columns = "what a training step trains", "solves for rays"
+        found["benchmark, counts"] = _common.table(columns, results["counts"].items())
     return found
 
 
 def draw(results: dict[str, Any], figures: pathlib.Path) -> None:
     """Draws run time against error, and its growth."""
     if "work" in results:
-        figure, axes = show.new(1, 1, 5.5, 4)
-        _plots.growth(axes, results["work"])
-        figure.savefig(figures / "work.png")
+        with _plots.picture(figures / "work.png", 5.5, 4) as (ax,):
+            _plots.growth(ax, results["work"])
     if results.get("curves"):
         tasks = _common.grouped(results["curves"], "task")
-        figure, axes = _common.panels(len(tasks), 6.5, 5.6)
-        for ax, ((task,), rows) in zip(axes, tasks.items()):
-            _plots.programs(ax, _common.grouped(rows, "program", "sampling"), task)
-        figure.savefig(figures / "peers.png")
+        with _plots.picture(figures / "peers.png", 6.5, 5.6, len(tasks)) as axes:
+            for ax, ((task,), rows) in zip(axes, tasks.items()):
+                _plots.programs(ax, _common.grouped(rows, "program", "sampling"), task)
     if results.get("profile"):
         with _plots.picture(figures / "profile.png", 4.3, 4.0, len(_profile.TOLERANCES), 3) as axes:
             for k, (ax, tolerance) in enumerate(zip(axes, _profile.TOLERANCES)):

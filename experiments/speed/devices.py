@@ -16,11 +16,11 @@ import jax
 import numpy as np
 
 import drt_jax
-from drt_jax import Scene, learn, show
+from drt_jax import Scene, learn
 from drt_jax.devices import copied, shared, split
 from drt_jax.learn import train
 
-from . import _command, _common, _settings, _sharing
+from . import _command, _common, _plots, _settings, _sharing
 from ._common import different, within
 from .runs.folder import Run
 
@@ -63,11 +63,9 @@ def run(config: Config, run: Run) -> dict[str, Any]:
         """Function that takes a step with the images of `count` devices and returns its loss, and
         the lowered program."""
         imager = train.make_imager(blur, shared(restore, mesh, 1), train.Camera())
-        rates = {"optics": 1e-3, "network": 1e-3}
-        begin, step = train.make_step(imager, rates, (25e3, 25e3), 0)
+        begin, step = train.make_step(imager, {"optics": 1e-3, "network": 1e-3}, (25e3, 25e3), 0)
         state = [copied(mesh, begin(start))]
-        some = split(mesh, scenes[: count * config.images])
-        rest = some, np.float32(0.01), np.int32(0)
+        rest = split(mesh, scenes[: count * config.images]), np.float32(0.01), np.int32(0)
 
         def take() -> float:
             state[0], found = step(state[0], *rest)
@@ -79,8 +77,12 @@ def run(config: Config, run: Run) -> dict[str, Any]:
     for count in config.counts:
         alone, _ = step_of(count, None)
         together, lowered = step_of(count, _sharing.mesh_of(count))
-        row = {"devices": count, "images": count * config.images}
-        row |= {"carried_bytes": _carried(lowered.compile().as_text())}
+        carried = 0
+        for result in re.findall(r"= (.*?) all-reduce(?:-start)?\(", lowered.compile().as_text()):
+            for kind, shape in re.findall(r"(\w+)\[([\d,]*)\]", result):
+                numbers = np.prod([int(n) for n in shape.split(",") if n])
+                carried += _BYTES.get(kind, 4) * int(numbers)
+        row = {"devices": count, "images": count * config.images, "carried_bytes": carried}
         rows.append(row | {"loss_apart": abs(together() / alone() - 1)})
         calls += [together, alone]
     seconds = np.reshape(_common.medians(calls, config.repeats), (-1, 2))
@@ -88,15 +90,6 @@ def run(config: Config, run: Run) -> dict[str, Any]:
         row |= dict(zip(("step_s", "alone_s"), pair))
     weights = train.count_parameters(start["network"])
     return {"rows": rows, "device": jax.devices()[0].device_kind, "weights": weights}
-
-
-def _carried(program: str) -> int:
-    """Bytes that the devices of a compiled program add up."""
-    total = 0
-    for result in re.findall(r"= (.*?) all-reduce(?:-start)?\(", program):
-        for kind, shape in re.findall(r"(\w+)\[([\d,]*)\]", result):
-            total += _BYTES.get(kind, 4) * int(np.prod([int(n) for n in shape.split(",") if n]))
-    return total
 
 
 def tables(results: dict[str, Any]) -> dict[str, str]:
@@ -112,16 +105,15 @@ def tables(results: dict[str, Any]) -> dict[str, str]:
 
 def draw(results: dict[str, Any], figures: pathlib.Path) -> None:
     """Draws the time of an image over the number of devices."""
-    figure, axes = show.new(width=6, height=4)
     rows = results["rows"]
     counts = [row["devices"] for row in rows]
-    for key, label in (("step_s", "shared"), ("alone_s", "one device, as many images")):
-        axes.plot(counts, [1e3 * row[key] / row["images"] for row in rows], "o-", label=label)
-    axes.set_xscale("log", base=2)
-    axes.set_xticks(counts, counts)
-    axes.set(xlabel="devices", ylabel="time of an image, ms", ylim=(0, None))
-    axes.legend()
-    figure.savefig(figures / "scaling.png")
+    with _plots.picture(figures / "scaling.png", 6, 4) as (axes,):
+        for key, label in (("step_s", "shared"), ("alone_s", "one device, as many images")):
+            axes.plot(counts, [1e3 * row[key] / row["images"] for row in rows], "o-", label=label)
+        axes.set_xscale("log", base=2)
+        axes.set_xticks(counts, counts)
+        axes.set(xlabel="devices", ylabel="time of an image, ms", ylim=(0, None))
+        axes.legend()
 
 
 if __name__ == "__main__":

@@ -8,11 +8,11 @@ factors and the errors.
 """
 
 import dataclasses
-import functools
 import math
 import pathlib
 import sys
 from collections.abc import Callable
+from functools import partial
 from typing import Annotated, Any, NamedTuple
 
 import jax
@@ -30,39 +30,34 @@ class Skip(NamedTuple):
 
     group: of rows.
     name: what is skipped.
-    error_of: what errors are relative to.
     ways: function of the settings that returns the `_skips.Way` with the skip and that without.
+    error_of: what errors are relative to.
     """
 
     group: str
     name: str
-    error_of: str
     ways: Callable[[Any], list[_skips.Way]]
+    error_of: str = "spot radius"
 
 
-_RADIUS, _LIGHT = "spot radius", "light"
+_DEPTH = "sensor and depth"
 SKIPS = {
-    "rotational": Skip("rays", "rotational symmetry", _RADIUS,
-                       functools.partial(_skips.symmetry, on_axis=True)),
-    "bilateral": Skip("rays", "bilateral symmetry", _RADIUS,
-                      functools.partial(_skips.symmetry, on_axis=False)),
-    "order": Skip("rays", "order from the error", _RADIUS, _skips.order),
-    "anew": Skip("rays", "order found in each call", _RADIUS, _skips.found_anew),
-    "quadrature": Skip("rays", "quadrature, not random rays", _RADIUS, _skips.quadrature),
-    "dead": Skip("rays", "dead surfaces", _RADIUS, _skips.dead),
-    "aiming": Skip("rays", "aiming, no search", _RADIUS, _skips.aimed),
-    "reverse": Skip("derivatives", "one derivative, reverse", "derivative",
-                    functools.partial(_skips.derivatives, forward=False)),
-    "forward": Skip("derivatives", "one derivative, forward", "derivative",
-                    functools.partial(_skips.derivatives, forward=True)),
-    "sensor": Skip("sensor and depth", "polynomials of the sensor", _RADIUS, _skips.sensors),
-    "depth": Skip("sensor and depth", "Chebyshev nodes of depth", _RADIUS, _skips.depths),
-    "separable": Skip("pictures", "separable kernels", "white", _skips_pictures.separable),
-    "polynomials": Skip("pictures", "polynomials, not rays", _LIGHT, _skips_pictures.polynomials),
-    "kernels": Skip("pictures", "few kernels for all pixels", _LIGHT,
-                    _skips_pictures.few_kernels),
-    "kept": Skip("programs", "programs kept", _RADIUS, _skips_pictures.kept),
-}  # fmt: skip
+    "rotational": Skip("rays", "rotational symmetry", partial(_skips.symmetry, on_axis=True)),
+    "bilateral": Skip("rays", "bilateral symmetry", partial(_skips.symmetry, on_axis=False)),
+    "order": Skip("rays", "order from the error", _skips.order),
+    "anew": Skip("rays", "order found in each call", _skips.found_anew),
+    "quadrature": Skip("rays", "quadrature, not random rays", _skips.quadrature),
+    "dead": Skip("rays", "dead surfaces", _skips.dead),
+    "aiming": Skip("rays", "aiming, no search", _skips.aimed),
+    "reverse": Skip("derivatives", "one derivative, reverse", _skips.reverse, "derivative"),
+    "forward": Skip("derivatives", "one derivative, forward", _skips.forward, "derivative"),
+    "sensor": Skip(_DEPTH, "polynomials of the sensor", _skips.sensors),
+    "depth": Skip(_DEPTH, "Chebyshev nodes of depth", _skips.depths),
+    "separable": Skip("pictures", "separable kernels", _skips_pictures.separable, "white"),
+    "polynomials": Skip("pictures", "polynomials, not rays", _skips_pictures.polynomials, "light"),
+    "kernels": Skip("pictures", "few kernels for all pixels", _skips_pictures.few_kernels, "light"),
+    "kept": Skip("programs", "programs kept", _skips_pictures.kept),
+}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -123,7 +118,7 @@ def run(config: Config, run: Run) -> dict[str, Any]:
     # Programs saved by another run would hide the time of compilation.
     jax.config.update("jax_enable_compilation_cache", False)
     chosen = {name: SKIPS[name] for name in config.rows or SKIPS}
-    jobs = {name: functools.partial(measure, config, skip) for name, skip in chosen.items()}
+    jobs = {name: partial(measure, config, skip) for name, skip in chosen.items()}
     return {"rows": _common.measured(run, "skip", jobs), "seconds": run.seconds}
 
 
@@ -158,8 +153,7 @@ def draw(results: dict[str, Any], figures: pathlib.Path) -> None:
     """Draws bars of the factors, the largest first, and beside them the errors of both ways."""
     rows = sorted(results["rows"], key=lambda row: row["factor"])
     places = np.arange(len(rows))
-    height = 0.36 * len(rows) + 1.3
-    figure, (left, right) = show.new(1, 2, 5.6, height)
+    figure, (left, right) = show.new(1, 2, 5.6, 0.36 * len(rows) + 1.3)
     right.sharey(left)
     colours = ["C0" if row["factor"] > 1 else "0.6" for row in rows]
     left.barh(places, [row["factor"] - 1 for row in rows], 0.6, 1, color=colours)

@@ -149,8 +149,7 @@ class Setup:
         remedy = f"{room} need {least} cells of waves: raise judge.cells or give a smaller kernel"
         _common.require(config.judge.cells >= least, remedy)
         if config.taps:
-            side = min(_SIDE, patches.train.shape[1])
-            self._power = learn.power_of(patches.train, side)
+            self._power = learn.power_of(patches.train, min(_SIDE, patches.train.shape[1]))
             options = *self.pixels, self.model.kind, self.model.cells
             kernels = lambda lens, rays: design.psf(lens, rays, *options)  # noqa: E731
             error = design.filter_error(kernels, self._axis, np.array(self.noise), self._power)
@@ -171,9 +170,8 @@ class Setup:
         vary = [v for v in config.variables if v.kind not in held]
         free = free and bool(config.stops)
         for solve in config.solves:
-            own = dataclasses.replace(
-                solve, distance=self.depths[1], wavelengths=(config.wavelengths_um[1],)
-            )
+            waves = (config.wavelengths_um[1],)
+            own = dataclasses.replace(solve, distance=self.depths[1], wavelengths=waves)
             is_pupil = own.kind == "entrance_pupil"
             if not (free and is_pupil):
                 solves.append(own.with_value(own.value * stop) if is_pupil else own)
@@ -264,8 +262,7 @@ class Setup:
         with warnings.catch_warnings():
             warnings.filterwarnings("ignore", "size: ")  # light beside kernels is judged below
             try:
-                tolerance = self.config.camera.tolerance
-                model = drt_jax.converge(drt_jax.psf, *given, "rays", tolerance)
+                model = drt_jax.converge(drt_jax.psf, *given, "rays", self.config.camera.tolerance)
                 if self.config.camera.kind == "waves":
                     model = dataclasses.replace(model, kind="waves", cells=self.config.judge.cells)
             except ValueError as error:
@@ -287,11 +284,9 @@ class Setup:
         """A lens as built, with the sensor at its own paraxial focus if that is asked for."""
         if not self.config.refocus:
             return built
-        focus = [
-            drt_jax.first_order(one, jnp.inf, self.waves[1]).back_focal_distance[0]
-            for one in (lens, built)
-        ]
-        return dataclasses.replace(built, sensor=built.sensor + focus[1] - focus[0])
+        both = (drt_jax.first_order(one, jnp.inf, self.waves[1]) for one in (lens, built))
+        ideal, own = (first.back_focal_distance[0] for first in both)
+        return dataclasses.replace(built, sensor=built.sensor + own - ideal)
 
     def _psfs(self, optics: Any, seen: ObjectPoints, waves: Any, model: Any) -> drt_jax.results.Psf:
         lens = self.lens_of(optics["lens"], seen.deviations)
@@ -396,8 +391,7 @@ class Setup:
     @functools.cached_property
     def _taps(self) -> Callable[[Any], Array]:
         """The taps of the best filter of a lens, over the field and all depths."""
-        key = jax.random.key(0)
-        seen = draw_points(key, _RINGS * _DEPTHS, self.field, self.depths)
+        seen = draw_points(jax.random.key(0), _RINGS * _DEPTHS, self.field, self.depths)
 
         def taps(optics: Any) -> Array:
             kernels, light = self.points(optics, seen)

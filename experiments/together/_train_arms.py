@@ -30,6 +30,8 @@ _APART = 10**7
 # Patches of a picture; of a photograph through two lenses its side, pixels, and its place in the
 # field.
 _SHOWN, _SIDE, _PLACE = 5, 112, 0.9
+# Parameters by arm and seed.
+Trained = dict[tuple[str, int], Any]
 
 
 def run(config: Any, run: Run) -> dict[str, Any]:
@@ -67,7 +69,8 @@ def run(config: Any, run: Run) -> dict[str, Any]:
     some = np.unique(np.linspace(0, len(angles) - 1, _SHOWN).astype(int))
     pictures = {}
     for arm in arms:
-        images = _pictures(setup, imager, trained[arm, 0])
+        patches = _one_each(setup, _training.textured(setup.patches.test, len(angles)))
+        images = _training.images(imager, trained[arm, 0], patches, setup.judged, setup.noise, 0)
         pictures |= {f"{arm} {name}": array[some] for name, array in images.items()}
     builds = _as_built(setup, run, trained, test.get("others")) if config.judge.builds else []
     return {
@@ -91,9 +94,8 @@ def _map(setup: Setup, run: Run) -> list[dict[str, Any]]:
     """PSNR behind the best filter and f-number of finished lenses, for each scene of the map."""
     rows, asked = [], setup.config.map
     for near, noise in itertools.product(asked.near_m, asked.noise):
-        scene = dataclasses.replace(
-            setup.config, depth_m=(near, setup.config.depth_m[1]), noise=noise
-        )
+        depths = near, setup.config.depth_m[1]
+        scene = dataclasses.replace(setup.config, depth_m=depths, noise=noise)
         what = f"{near:g} m, noise {noise:g}"
         print(f"map: {what}", flush=True)
 
@@ -180,8 +182,7 @@ def _judged(
     count, found = len(setup.judged.fields), {}
     for name, every in test.items():
         patches = _training.thinned(every, setup.config.judge.patches * count)
-        given = patches, setup.judged, setup.noise, 0, count
-        own = train.evaluate(imager, parameters, *given)
+        own = train.evaluate(imager, parameters, patches, setup.judged, setup.noise, 0, count)
         found |= {f"{name}_psnr": own["psnr"]} if name else own
     return found
 
@@ -191,16 +192,7 @@ def _one_each(setup: Setup, patches: np.ndarray) -> np.ndarray:
     return np.resize(patches, (len(setup.judged.fields), *patches.shape[1:]))
 
 
-def _pictures(setup: Setup, imager: Callable, parameters: Any) -> dict[str, np.ndarray]:
-    """Images of the judge, a patch for each of its points."""
-    some = _training.textured(setup.patches.test, len(setup.judged.fields))
-    given = _one_each(setup, some), setup.judged, setup.noise, 0
-    return _training.images(imager, parameters, *given)
-
-
-def _photograph(
-    setup: Setup, side: int, trained: dict[tuple[str, int], Any], rows: list[dict]
-) -> dict[str, Any]:
+def _photograph(setup: Setup, side: int, trained: Trained, rows: list[dict]) -> dict[str, Any]:
     """Part of a photograph through the lens and network of the first arm, and of the best arm.
 
     rows: of lenses as built, or of arms. Where they are of lenses as built, both lenses have the
@@ -234,9 +226,7 @@ def _built_lenses(setup: Setup) -> np.ndarray:
     return design.draw_perturbations(setup.built, setup.config.judge.builds, SEED + 1)
 
 
-def _as_built(
-    setup: Setup, run: Run, trained: dict[tuple[str, int], Any], others: np.ndarray | None
-) -> list[dict]:
+def _as_built(setup: Setup, run: Run, trained: Trained, others: np.ndarray | None) -> list[dict]:
     """PSNR of lenses as built, of arms that begin with a lens whose spots are finished, by rays at
     the points of the judge; with prefix `others_` of other photographs."""
     imager = jax.jit(FieldImager(setup.points, setup.restore).__call__)

@@ -29,7 +29,7 @@ from drt_jax.design import Operand, Solve, Tie, Tolerance, Vary
 from drt_jax.learn.data import DataConfig
 
 from . import _command, _common, _plots, _report, _settings, _sharing
-from ._common import Colours, different, near_and_far, not_empty, odd, within
+from ._common import Colours, different, near_and_far, not_empty, odd, or_zero, within
 from ._setup import ARMS
 from ._train_arms import run as run
 from .runs.folder import Run as Run
@@ -161,7 +161,7 @@ class Config:
     camera: Camera = Camera()
     noise: Annotated[float, within(0, 10)] = 0.01
     shot: Annotated[float, within(0, 10)] = 0.0
-    taps: Annotated[int, within(0, 63)] = 0
+    taps: Annotated[int, within(0, 63), or_zero(odd)] = 0
     mtf_at: Annotated[float, within(1e-3, 1e4)] = 30.0
     network: _settings.Net = _settings.Net()
     train: Training = Training()
@@ -185,13 +185,11 @@ class Config:
             if begins in ("stopped", "freed") and not self.stops:
                 lacks.append("stops")
             _common.require(not lacks, f"arms: {arm} needs {' and '.join(lacks)}")
-        kinds = sorted({vary.kind for vary in self.variables})
-        _common.require_known("held", self.held, kinds)
+        _common.require_known("held", self.held, sorted({vary.kind for vary in self.variables}))
         fits = not self.taps or self.camera.kernel < 64
         _common.require(fits, "camera.kernel: expected at most 63 pixels where there are taps")
         solved = not self.stops or "entrance_pupil" in {solve.kind for solve in self.solves}
         _common.require(solved, "stops: needs the solve entrance_pupil")
-        _common.require(self.taps % 2 or not self.taps, "taps: expected an odd number, or 0")
         asked = self.map.noise or self.map.near_m or self.map.plates
         mapped = not asked or (self.taps and self.stops)
         _common.require(bool(mapped), "map: needs taps above 0 and stops")
@@ -233,10 +231,9 @@ def tables(results: dict[str, Any]) -> dict[str, str]:
     if "others_psnr" in results["rows"][0]:
         header = ["arm", "PSNR dB of other photographs", "least coloured third", "most coloured"]
         names = [f"{name}_psnr" for name in ("others", "grey", "coloured")]
-        lines = [
-            [ARMS[arm].title, *(_spread([row[name] for row in own], 2) for name in names)]
-            for (arm,), own in groups.items()
-        ]
+        lines = []
+        for (arm,), own in groups.items():
+            lines.append([ARMS[arm].title, *(_spread([row[n] for row in own], 2) for n in names)])
         found[f"joint, {name}: other photographs"] = _common.table(header, lines)
     behind = results["filter_db"]
     if any(behind.values()):

@@ -13,7 +13,6 @@ import drt_jax
 
 from ._offaxis import Walk, conic_mirror, local_mirror, relay
 from ._scenes import (
-    WAVELENGTH,
     Scenes,
     batch_of,
     fields,
@@ -31,6 +30,7 @@ from ._situations import (
     files,
     immersed,
     inside_focus,
+    paraxial,
 )
 
 _FREEFORM = ("biconic", "toroid", "odd_asphere", "polynomial_xy", "asphere", "asphere")
@@ -153,11 +153,8 @@ def focus(rng, count, stop):
     """The sensor exactly at the paraxial focus; and stigmatic ellipsoids with a spot of 0."""
     parts, h, media = two_elements(rng, count, stop, (1, 16))
     scenes = scenes_of(rng, parts, h, stop, media, (0, 5))
-    image = jax.vmap(
-        lambda lens, d: drt_jax.first_order(lens, d, jnp.array([WAVELENGTH])).image_distance[0]
-    )
     last = np.sum(parts["thickness"], axis=1)
-    sensor = np.asarray(jax.jit(image)(scenes.lens, jnp.asarray(scenes.distance)))
+    sensor = np.asarray(paraxial(scenes.lens, scenes.distance)[1])
     sensor = np.where((sensor > last) & (sensor < last + 40 * h), sensor, parts["sensor"])
     ideal = rng.random(count) < 0.3
     n, c = media[:, 1], rng.uniform(0.05, 0.6, count) / h

@@ -17,6 +17,7 @@ from ._scenes import WAVELENGTH, Scenes, batch_of, fields, pupil_points, scenes_
 
 # Lens files beside a checkout; they are not part of it.
 FILES = ROOT.parent / "shared" / "data" / "lens_files"
+_SHAPE = "curvature", "conic", "coefficients"
 
 
 def immersed(rng, parts, h, media):
@@ -28,7 +29,7 @@ def immersed(rng, parts, h, media):
 
 @jax.jit
 @jax.vmap
-def _first_order(lens, distance):
+def paraxial(lens, distance):
     """Distance from the front focus to the first vertex, and z of the paraxial image, mm."""
     found = drt_jax.first_order(lens, distance, jnp.array([WAVELENGTH]))
     return -found.front_focal_distance[0], found.image_distance[0]
@@ -50,19 +51,18 @@ class Conjugate(NamedTuple):
         n = 12 * count
         parts, h, media = two_elements(rng, n, stop, (2, 16))
         scenes = scenes_of(rng, parts, h, stop, media, (0, 5))
-        front = np.asarray(_first_order(scenes.lens, np.full(n, np.inf))[0])
+        front = np.asarray(paraxial(scenes.lens, np.full(n, np.inf))[0])
         distance = self.place(rng, front, h)
         fits = ~np.isnan(distance)
-        image = np.asarray(_first_order(scenes.lens, np.where(fits, distance, np.inf))[1])
+        image = np.asarray(paraxial(scenes.lens, np.where(fits, distance, np.inf))[1])
         last = np.sum(parts["thickness"], axis=1)
         seen = (image < last - 0.1 * h) & (image > last - 100 * h)
         seen &= rng.random(n) < self.virtual
         fits &= seen | (self.virtual < 1)
         parts["sensor"] = np.where(seen, image, parts["sensor"])
         chosen = np.flatnonzero(fits)[:count]
-        lens = batch_of(
-            {name: a[chosen] for name, a in parts.items()}, h[chosen], stop, media[chosen]
-        )
+        some = {name: a[chosen] for name, a in parts.items()}
+        lens = batch_of(some, h[chosen], stop, media[chosen])
         return Scenes(lens, scenes.field[chosen], distance[chosen], scenes.pupil[chosen])
 
 
@@ -111,9 +111,7 @@ def _read(path):
         z = np.append(np.asarray(lens.vertices)[kept], lens.sensor)
         if np.min(np.diff(z)) < 1e-3:
             return None
-        parts = {
-            n: np.asarray(getattr(lens, n))[kept] for n in ("curvature", "conic", "coefficients")
-        }
+        parts = {name: np.asarray(getattr(lens, name))[kept] for name in _SHAPE}
         parts["thickness"] = np.diff(z)
         index = np.asarray(lens.index([system.wavelengths[system.primary]]))[:, 0]
         media = index[[*kept, lens.count]]
@@ -130,7 +128,7 @@ def _padded(row, stop, surfaces, terms):
     front, old = stop - row.stop, len(row.media) - 1
     back = surfaces - old - front
     rows = {}
-    for name in ("curvature", "conic", "coefficients"):
+    for name in _SHAPE:
         a = row.parts[name]
         wide = [(0, terms - a.shape[1])] if a.ndim == 2 else []
         rows[name] = np.pad(a, [(front, back), *wide])
@@ -156,9 +154,7 @@ def files(rng, count, _):
         parts[name] *= 1 + 0.03 * rng.uniform(-1, 1, parts[name].shape)
     parts["sensor"] = np.sum(parts["thickness"], axis=1)
     parts["thickness"] = parts["thickness"][:, :-1]
-    h, widest, far = (
-        np.array([getattr(found[k], name) for k in pick]) for name in _Row._fields[3:]
-    )
+    h, widest, far = map(np.array, zip(*(found[k][3:] for k in pick)))
     lens = batch_of(parts, h, stop, np.stack([padded[k][1] for k in pick]))
     field = fields(rng, count, 0, np.minimum(1.2 * widest, 60))
     return Scenes(lens, field, far, pupil_points(rng, count))

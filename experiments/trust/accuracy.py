@@ -220,15 +220,10 @@ def measure(config: Config, scene: AccuracyScene) -> dict[str, list[dict]]:
     for size in (n for n in config.rays if n <= scene.most_rays):
         found = patterns(size, config.seeds, scene.dtype)
         kinds += [(name, size, rules) for name, rules in found.items()]
-    curves = [
-        {"method": name, "size": size} | row_of(arguments, truth, rules)
-        for name, size, rules in kinds
-    ]
+    curves = [{"method": n, "size": k} | row_of(arguments, truth, rules) for n, k, rules in kinds]
     tolerances = []
     for tolerance in config.tolerances:
-        row = dict.fromkeys(("tolerance", "order", "rays", "relative_error")) | {
-            "tolerance": tolerance
-        }
+        row = {"tolerance": tolerance, "order": None, "rays": None, "relative_error": None}
         tolerances.append(row)
         try:
             rule = drt_jax.converge(drt_jax.psf_moments, *arguments, tolerance)
@@ -274,9 +269,8 @@ def tables(results: dict[str, Any]) -> dict[str, str]:
         cells = [panel]
         for rows in grouped(some, "tolerance").values():
             kept = [row for row in rows if row["rays"] is not None]
-            worst, most = (
-                max((row[k] for row in kept), default=0) for k in ("relative_error", "rays")
-            )
+            worst = max((row["relative_error"] for row in kept), default=0)
+            most = max((row["rays"] for row in kept), default=0)
             cells.append(f"{most}, {worst:.1e}" if len(kept) == len(rows) else "refused")
         costs.append(cells)
     first = "most rays a colour, worst error"
@@ -307,12 +301,11 @@ def draw(results: dict[str, Any], figures: pathlib.Path) -> None:
         ("rays_error", "rays", "relative_error", "rays a colour", "σ"),
         ("gradient_error", "rays", "gradient_error", "rays a colour", "dσ"),
     ):
-        figure, axes = _common.panels(len(groups), 5.2, 3.9)
-        for ax, ((panel,), rows) in zip(axes, groups.items()):
-            draw_panel(ax, rows, x, y, (xlabel, f"error of {ylabel}, relative"))
-            count = len(grouped(rows, "scene"))
-            ax.set_title(f"{panel}, {count} scene{'s' * (count != 1)}", fontsize=10)
-        figure.savefig(figures / f"{name}.png")
+        with _plots.picture(figures / f"{name}.png", 5.2, 3.9, len(groups)) as axes:
+            for ax, ((panel,), rows) in zip(axes, groups.items()):
+                draw_panel(ax, rows, x, y, (xlabel, f"error of {ylabel}, relative"))
+                count = len(grouped(rows, "scene"))
+                ax.set_title(f"{panel}, {count} scene{'s' * (count != 1)}", fontsize=10)
     keys = "reference_error", "reference_gradient_error"
     error, slope = (max(row[key] for row in results["truth"]) for key in keys)
     print(f"\nerrors of the reference, at most: values {error:.0e}, gradients {slope:.0e}")

@@ -16,8 +16,6 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 
-from drt_jax import show
-
 from . import _command, _common, _damaged_files, _ended, _plots
 from ._common import within
 from ._damaged_files import OUTCOMES
@@ -65,8 +63,7 @@ def run(config: Config, run: Run) -> dict[str, Any]:
             return [*rows_of(config, part, pathlib.Path(folder))]
 
     jobs = {part: functools.partial(rows, part) for part in config.parts or PARTS}
-    found = _common.measured(run, "part", jobs)
-    return {"rows": sum(found, []), "seconds": run.seconds}
+    return {"rows": sum(_common.measured(run, "part", jobs), []), "seconds": run.seconds}
 
 
 def tables(results: dict[str, Any]) -> dict[str, str]:
@@ -80,10 +77,9 @@ def tables(results: dict[str, Any]) -> dict[str, str]:
 
 def draw(results: dict[str, Any], figures: pathlib.Path) -> None:
     """Draws the outcomes of each kind."""
-    figure, axes = show.new(1, 1, 8, 3.6)
     rows = {row["kind"]: [row[name] for name in OUTCOMES] for row in results["rows"]}
-    _plots.shares(axes, rows, OUTCOMES)
-    figure.savefig(figures / "faults.png")
+    with _plots.picture(figures / "faults.png", 8, 3.6) as (axes,):
+        _plots.shares(axes, rows, OUTCOMES)
 
 
 if __name__ == "__main__":

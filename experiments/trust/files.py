@@ -25,7 +25,6 @@ from typing import Any
 import numpy as np
 
 import drt_jax
-from drt_jax import show
 
 from . import _command, _common, _plots
 from .runs.folder import Run
@@ -35,12 +34,8 @@ FORMATS = (".zmx", ".seq", ".yaml")
 _NEAR = 1e-3
 _INDEX = 2e-9  # silica's constants have one digit more in some programs
 Read = tuple[list[float], list[float], float | None]
-_NUMBERS = (
-    "Effective Focal Length",
-    "Image Space F/#",
-    "Entrance Pupil Diameter",
-    "Entrance Pupil Position",
-)
+_WIDE, _PLACE = "Entrance Pupil Diameter", "Entrance Pupil Position"
+_NUMBERS = "Effective Focal Length", "Image Space F/#", _WIDE, _PLACE
 
 
 @dataclasses.dataclass(frozen=True)
@@ -83,11 +78,7 @@ def _rayoptics(path: str) -> Read:
 
 # [focal length, f-number, diameter and position of the entrance pupil], indices of all media, and
 # the distance from the object to the origin of that position; None for surface 1, as in listings.
-READERS: dict[str, Callable[[str], Read]] = {
-    "drt_jax": _ours,
-    "optiland": _optiland,
-    "rayoptics": _rayoptics,
-}
+READERS: dict[str, Callable] = {"drt_jax": _ours, "optiland": _optiland, "rayoptics": _rayoptics}
 
 
 def listed(content: str, key: str) -> tuple[float, float] | None:
@@ -116,18 +107,18 @@ def differences(
     """(relative error, whether it is right, text) of each number of a listing. Signs are not
     compared, because programs differ behind mirrors; listings write 1e10 for no focal length."""
     found = []
-    wide = (listed(content, _NUMBERS[2]) or (1.0,))[0]
+    wide = (listed(content, _WIDE) or (1.0,))[0]
     finite = re.search(r"^ OBJ\s+\S+\s+\S+\s+([-+.\dEe]+)\s", content, re.MULTILINE)
     if finite and far is not None:
         first = [*first[:3], first[3] + far - float(finite[1])]
     for key, value in zip(_NUMBERS, first):
         number, step = listed(content, key) or (value, 0.0)
-        if key != _NUMBERS[3]:
+        if key != _PLACE:
             value, number = abs(value), abs(number)
         if min(abs(value), abs(number)) >= 1e7:
             continue
         off = abs(value - number)
-        size = max(abs(number), wide if key == _NUMBERS[3] else 0.0)
+        size = max(abs(number), wide if key == _PLACE else 0.0)
         right = off <= max(1.01 * step, 1e-9 * size)
         found.append((off / size, right, f"{key} {value:.7g}, listed {number:.7g}"))
     both = indices, listed_indices(content)
@@ -222,11 +213,6 @@ def counts(rows: list[dict[str, Any]], reader: str) -> list[int]:
     return [own.count(name) for name in OUTCOMES]
 
 
-def _cell(row: dict[str, Any]) -> str:
-    wrong = row["outcome"] in ("near", "wrong") and row["off"] is not None
-    return f"{row['outcome']} ({row['off']:.0e})" if wrong else row["outcome"]
-
-
 def tables(results: dict[str, Any]) -> dict[str, str]:
     """Tables of outcomes by file and program, and of their numbers. `why` is our message, else the
     error of another program."""
@@ -234,7 +220,11 @@ def tables(results: dict[str, Any]) -> dict[str, str]:
     for (name,), group in _common.grouped(results["rows"], "file").items():
         errors = [f"{row['reader']}: {row['why']}" for row in group if row["outcome"] == "wrong"]
         why = [group[0]["why"]] if group[0]["why"] else errors[:1]
-        rows.append([name, *map(_cell, group), "".join(why)])
+        cells = []
+        for row in group:
+            wrong = row["outcome"] in ("near", "wrong") and row["off"] is not None
+            cells.append(row["outcome"] + (f" ({row['off']:.0e})" if wrong else ""))
+        rows.append([name, *cells, "".join(why)])
     totals = [[reader, *counts(results["rows"], reader)] for reader in READERS]
     again = [row["trips"] | {"file": row["file"]} for row in results["rows"] if "trips" in row]
     written = []
@@ -250,10 +240,9 @@ def tables(results: dict[str, Any]) -> dict[str, str]:
 
 def draw(results: dict[str, Any], figures: pathlib.Path) -> None:
     """Draws the number of files of each outcome."""
-    figure, axes = show.new(1, 1, 8, 2.4)
     shares = {reader: counts(results["rows"], reader) for reader in READERS}
-    _plots.shares(axes, shares, OUTCOMES)
-    figure.savefig(figures / "files.png")
+    with _plots.picture(figures / "files.png", 8, 2.4) as (axes,):
+        _plots.shares(axes, shares, OUTCOMES)
 
 
 if __name__ == "__main__":

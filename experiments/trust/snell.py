@@ -18,11 +18,7 @@ from drt_jax.lens.forms import Shape
 from drt_jax.lens.surface import domain, sag_derivatives
 
 # Of XLA, for programs that trace many rays a few times.
-QUICK = {
-    **LARGE,
-    "xla_backend_optimization_level": 1,
-    "xla_llvm_disable_expensive_passes": True,
-}
+QUICK = {**LARGE, "xla_backend_optimization_level": 1, "xla_llvm_disable_expensive_passes": True}
 _NEWTON_STEPS = 40  # a nearly grazing ray only halves its distance in each
 
 

@@ -15,7 +15,7 @@ import jax
 import numpy as np
 from scipy import stats
 
-from drt_jax import Status, show
+from drt_jax import Status
 
 from . import _command, _common, _families, _plots
 from ._families import FAMILIES
@@ -166,15 +166,15 @@ def tables(results: dict[str, Any]) -> dict[str, str]:
 def draw(results: dict[str, Any], figures: pathlib.Path) -> None:
     """Draws steps and float32 errors by family."""
     rows = results["families"]
-    figure, axes = show.new(1, 2, 6, 1.5 + 0.14 * len(rows))
-    for ax, samples, size, label in (
-        (axes[0], results["newton_steps"], "scenes", "Newton steps of a scene"),
-        (axes[1], 1e3 * results["float32_error_mm"], "float32_rays", "float32 error (µm)"),
-    ):
-        cuts = np.cumsum([row[size] for row in rows])[:-1]
-        families = dict(zip([row["name"] for row in rows], np.split(samples, cuts)))
-        _plots.by_family(ax, families, label, log=size == "float32_rays")
-    figure.savefig(figures / "families.png")
+    parts = (
+        (results["newton_steps"], "scenes", "Newton steps of a scene"),
+        (1e3 * results["float32_error_mm"], "float32_rays", "float32 error (µm)"),
+    )
+    with _plots.picture(figures / "families.png", 6, 1.5 + 0.14 * len(rows), 2) as axes:
+        for ax, (samples, size, label) in zip(axes, parts):
+            cuts = np.cumsum([row[size] for row in rows])[:-1]
+            families = dict(zip([row["name"] for row in rows], np.split(samples, cuts)))
+            _plots.by_family(ax, families, label, log=size == "float32_rays")
 
 
 if __name__ == "__main__":

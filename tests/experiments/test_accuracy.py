@@ -190,19 +190,3 @@ def test_finished_run_resumes_to_the_same_numbers(small_run, capsys):
     after = json.loads((small_run / "results.json").read_text())
     assert before["curves"] == after["curves"] and before["tolerances"] == after["tolerances"]
     assert "most rays" in capsys.readouterr().out
-
-
-@pytest.mark.parametrize(
-    ("option", "message"),
-    [
-        ("orders=[2, 41]", "orders: expected 1 to 40"),
-        ("rays=[4]", "rays: expected 7 to 1e+07, got 4"),
-        ("scenes=[]", "scenes: needs at least one item"),
-        ("scenes=[{field_deg: -1}]", "scenes[0].field_deg: expected 0 to 89.9, got -1.0"),
-        ("scenes=[{dtype: float16}]", "scenes[0].dtype: expected one of float64, float32"),
-    ],
-)
-def test_bad_settings_get_one_clear_line(option, message, tmp_path, capsys):
-    with pytest.raises(SystemExit) as stopped:
-        _command.main(accuracy, ["--out", str(tmp_path / "run"), "--set", option])
-    assert stopped.value.code == 2 and message in capsys.readouterr().err

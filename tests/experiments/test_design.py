@@ -112,32 +112,6 @@ def test_a_phone_lens_from_a_crude_start(tmp_path, monkeypatch):
     )
 
 
-@pytest.mark.parametrize(
-    "setting, said",
-    [
-        ("variables=[{kind: curvture}]", "got 'curvture'; did you mean curvature?"),
-        ("variables=[{kind: curvature, low: 1, high: 0}]", "is not below high"),
-        ("variables=[{kind: curvature, surfaces: [9]}]", "no surface 9"),
-        ("variables=[{kind: sensor}, {kind: sensor}]", "twice"),
-        ("solves=[{kind: focal_length, value: 50}]", "give surface"),
-        ("operands=[]", "operands: needs at least one item"),
-        ("operands=[{kind: blur}]", "operands[0].kind: expected one of spot,"),
-        ("starts.how=anywhere", "one of normal, sobol, as_built"),
-        ("lens=nowhere.yaml", "nowhere.yaml"),
-        ("growth.first=2", "growth.first: expected"),
-        ("glasses={makers: [SCHOTT], names: zz*}", "glasses.names: no glass of these makers is"),
-        ("glasses={makers: [SCHOTT]}", "has no model glass; give nd and vd"),
-    ],
-)
-def test_bad_settings_get_one_line(setting, said, tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(ROOT)
-    with pytest.raises(SystemExit) as caught:
-        main("triplet", tmp_path / "run", setting)
-    message = capsys.readouterr().err.strip()
-    assert caught.value.code == 2 and said in message and "\n" not in message
-    assert len(message.removeprefix("error: ")) <= 300
-
-
 @pytest.mark.parametrize("path", sorted((ROOT / "configs" / "design" / "lenses").glob("*.yaml")))
 def test_starts_load(path):
     assert drt_jax.load_lens(path).count > 1

@@ -3,8 +3,6 @@ of them, and how a lens that goes bad ends a run."""
 
 import functools
 import json
-import os
-import signal
 
 import jax
 import jax.numpy as jnp
@@ -16,9 +14,8 @@ from drt_jax import Scene, learn
 from drt_jax.learn import train
 from drt_jax.pupil import hexapolar
 from experiments import _optics
-from experiments.runs.folder import Run
 
-from .test_experiments import SMALL, assert_same, main
+from .test_experiments import SMALL, assert_same, main, stop
 
 OWN = ["scene.lens=cooke_triplet", "scene.field=10"]
 RESTORE = [
@@ -91,20 +88,8 @@ def test_its_table_has_none_of_the_papers_numbers(own, capsys):
 
 
 @pytest.mark.slow
-def test_an_interrupted_run_resumes_to_the_same_lens(own, tmp_path, monkeypatch):
-    log, calls = Run.log, []
-
-    def interrupting(self, *args):
-        log(self, *args)
-        calls.append(1)
-        if len(calls) == 2:
-            os.kill(os.getpid(), signal.SIGINT)
-
-    monkeypatch.setattr(Run, "log", interrupting)
-    with pytest.raises(SystemExit) as stopped:
-        main("restore", "--out", tmp_path / "run", "--set", *RESTORE)
-    assert stopped.value.code == 130
-    monkeypatch.undo()
+def test_an_interrupted_run_resumes_to_the_same_lens(own, tmp_path):
+    stop("restore", tmp_path / "run", RESTORE, "start 60.1", 10)
     main("restore", "--resume", "--out", tmp_path / "run")
     assert_same(own, tmp_path / "run")
     name = "designed/start 60.1.yaml"
@@ -219,30 +204,6 @@ def test_a_thickness_leaves_the_sensor_where_it_is():
     values = some.start(60.2) | {"thickness 1": 6.5}
     found = some.lens_of(values)
     assert float(found.sensor) == 60.2 and float(found.thickness[1]) == 6.5
-
-
-REFUSED = {
-    "unknown": ("train.variables=[curvture]", "unknown 'curvture'; known: sensor, curvature, con"),
-    "size": ("train.variables=[semi_diameter]", "unknown 'semi_diameter'; known: sensor"),
-    "none": ("train.variables=[]", "train.variables: needs at least one item"),
-    "twice": ("train.variables=[sensor, sensor]", "train.variables: an item stands twice"),
-    "a word": ("train.variables=[curvature x]", "such as curvature 0, got 'curvature x'"),
-    "sensor": ("train.variables=[sensor 1]", "such as curvature 0, got 'sensor 1'"),
-    "surface": ("train.variables=[curvature 9]", "train.variables: curvature: no surface 9; there"),
-    "both": ("train.variables=[curvature, curvature 1]", "variables: curvature 1 stands twice"),
-    "no terms": ("train.variables=[coefficients]", "coefficients: the lens has none; write them"),
-    "steep": ("scene.field=90", "scene.field: expected -89 to 89, got 90"),
-    "three": ("scene.field=[1, 2, 3]", "scene.field: expected one angle in degrees, or [x, y]"),
-}
-
-
-@pytest.mark.parametrize("case", REFUSED)
-def test_what_is_refused(case, tmp_path, capsys):
-    setting, message = REFUSED[case]
-    with pytest.raises(SystemExit) as stopped:
-        main("restore", "--out", tmp_path / "run", "--set", *OWN, setting)
-    assert stopped.value.code == 2 and message in capsys.readouterr().err
-    assert not (tmp_path / "run").exists()
 
 
 def test_help_lists_what_may_be_trained(capsys):

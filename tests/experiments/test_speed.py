@@ -147,18 +147,18 @@ def test_our_nodes_through_another_tracer_come_to_the_reference(monkeypatch):
     monkeypatch.setattr(_peers, "SPOTS", {"snell": _peers.Spots(snell, slopes)})
     scene, truth = Scene.point(field, np.inf, (0.55,)), reference(*given)
     curved = dataclasses.replace(lens, curved=(lens.stop,))
-    every = _curves.ways(curved, scene, (), (3, 8), values := _peers.shifted(curved))
+    every = _curves.samplings(curved, scene, (), (3, 8), values := _peers.shifted(curved))
     nodes = [(name, of) for name, of in every if "our" in name]
     numbers = _peers.Lens(*given)
     error = partial(benchmark.spot_error, truth, lens.count)
-    tries, notes = _curves.peers(numbers, nodes, error, lambda spots, *given: spots.sigma(*given))
+    ways = _curves.of_spots(numbers, nodes, lambda spots, *given: spots.sigma(*given))
+    tries, notes = _curves.tried(ways, error)
     assert not notes
     coarse, fine = tries
     assert fine.program == "snell 1, launched by us" and fine.size == 8 * 9
     assert fine.error < 1e-11 < coarse.error < 1e-2
-    (moved,), _ = _curves.peers(
-        numbers, nodes[1:], lambda found: error(*found), lambda spots, *own: spots.gradient(*own)
-    )
+    ways = _curves.of_spots(numbers, nodes[1:], lambda spots, *own: spots.gradient(*own))
+    (moved,), _ = _curves.tried(ways, lambda found: error(*found))
     assert 1e-11 < moved.error < 1e-5
 
     # All variants, as a run of tolerances asks for them.
@@ -167,7 +167,7 @@ def test_our_nodes_through_another_tracer_come_to_the_reference(monkeypatch):
     def worst(found):
         return max(abs(s[0] / t.sigma[0] - 1) for s, t in zip(found, some))
 
-    (many,), _ = _curves.peers(numbers, nodes[1:], worst, _peers.of_all)
+    (many,), _ = _curves.tried(_curves.of_spots(numbers, nodes[1:], _peers.of_all), worst)
     assert many.error < 1e-11
 
 
@@ -207,7 +207,7 @@ def test_the_reference_of_waves_is_the_closed_form_of_a_perfect_lens():
 @pytest.mark.slow
 def test_the_reference_of_waves_agrees_with_the_library_off_axis():
     lens, field = drt_jax.load_lens("cooke_triplet"), np.radians(14)
-    at = _waves.view(lens, field, 0.55, _waves.Waves(size=9))
+    at = _waves.focused(lens, field, 0.55, _waves.Waves(size=9))
     scene = Scene.point(field, np.inf, (0.55,))
     mtf, change = wave.transfer(at.lens, field, 0.55, FREQUENCIES)
     own = drt_jax.transfer(at.lens, scene, FREQUENCIES, sampling=1e-4).mtf

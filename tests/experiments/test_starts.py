@@ -4,7 +4,6 @@ import importlib
 import json
 import pathlib
 import pkgutil
-import re
 
 import jax
 import numpy as np
@@ -263,51 +262,6 @@ def test_a_filter_in_front_of_the_network_and_the_best_stop(tmp_path):
     assert len(experiment.tables(results)) == 4
 
 
-@pytest.mark.parametrize(
-    "change, told",
-    [
-        pytest.param(
-            "camera={pixel_um: 4, kernel: 9, tolerance: 0.2}",
-            "camera.kernel: .* of the light of the spoilt lens falls beside a kernel of 9 pixels",
-            marks=pytest.mark.slow,
-        ),
-        pytest.param(
-            "judge={rings: 2, patches: 1, waves: 2, cells: 16}",
-            r"camera.kernel: 9 pixels of 20 um need \d+ cells of waves: raise judge.cells",
-            marks=pytest.mark.slow,
-        ),
-        ("train.batch=3", "train.batch: expected a multiple of train.points"),
-        ("arms=[frozen]", "arms: frozen needs spots"),
-        ("arms=[]", "arms: expected one or more, or a map"),
-        ("judge.others=nowhere", "judge.others: nowhere is not a folder; give one with images"),
-        ("judge.others={photos}", "judge.others: .*photos: expected four photographs or more"),
-        ("map.plates=[0, 1]", "map: needs taps above 0 and stops"),
-        ("map.noise=[0.1]", "map: needs taps above 0 and stops"),
-        ("arms=[filter]", "arms: filter needs taps above 0"),
-        ("arms=[freed]", "arms: freed needs taps above 0 and stops"),
-        ("arms=[built_network]", "tolerances: needs at least one item"),
-        ("model_glass=[0]", "model_glass: surfaces: no glass begins behind surface 0"),
-        ("held=[abbe]", "held: unknown 'abbe'; known: curvature, sensor"),
-        ("stops=[1]", "stops: needs the solve entrance_pupil"),
-        ("taps=4", "taps: expected an odd number, or 0"),
-        ("variables=[{kind: conic, surfaces: [9]}]", "variables: conic: no surface 9"),
-        ("judge.builds=5", "tolerances: needs at least one item"),
-        ("depth_m=[5, 1]", "depth_m: expected the nearest and the farthest"),
-    ],
-)
-def test_what_cannot_be_trained_is_refused_in_a_line(change, told, tmp_path, capsys):
-    (photos := tmp_path / "photos").mkdir()
-    for k in range(2):
-        Image.fromarray(np.full((40, 40, 3), 100 * k, np.uint8)).save(photos / f"{k}.png")
-    change = change.replace("{photos}", str(photos))
-    own = [key for key in STARTS["joint"] if not key.startswith(("arms", "tolerances", "judge"))]
-    with pytest.raises(SystemExit) as stopped:
-        experiment = importlib.import_module("experiments.joint")
-        _command.main(experiment, ["--out", str(tmp_path / "run"), "--set", *own, change])
-    message = capsys.readouterr().err.strip().splitlines()[-1]
-    assert stopped.value.code == 2 and re.search(told, message), message
-
-
 # Small kernels lose light.
 @pytest.mark.filterwarnings("ignore:size: ")
 @pytest.mark.parametrize(
@@ -357,7 +311,7 @@ def test_benchmark_starts_new_processes():
     first = _work._FIRST.format(lens="singlet", field=0.0, distance=1e4)
     config = benchmark.Config(lens="singlet", bundle=64, repeats=1)
     spread = _work.SPREAD.format(devices=1, config=config)
-    assert all(_work.in_a_new_process(code, {}) > 0 for code in (first, spread))
+    assert all(min(_work.in_a_new_process(code, {})) > 0 for code in (first, spread))
 
 
 def test_tables_has_nothing_to_write(capsys):

@@ -59,22 +59,3 @@ def test_it_writes_rows_and_pictures_and_resumes(config, tmp_path, capsys):
     again = json.loads((folder / "results.json").read_text())
     assert again.pop("machines") and results.pop("machines")
     assert again == results
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    "setting, said",
-    [
-        ("fields_deg=[[1]]", "fields_deg: expected pairs x, y from -89 to 89"),
-        ("scales=[]", "scales: needs at least one item"),
-        ("tolerances=[{kind: radii, size: 1}]", "got 'radii'; did you mean radius?"),
-        ("tolerances=[{kind: tilt, size: 1, which: [3]}]", "tilt: no element 3"),
-        ("compensator=focus and tilt", "the fields lie on a line"),
-    ],
-)
-def test_bad_settings_are_refused_in_a_line(config, tmp_path, capsys, setting, said):
-    with pytest.raises(SystemExit) as stopped:
-        main("--config", config, "--out", tmp_path / "run", "--set", setting)
-    assert stopped.value.code == 2
-    error = capsys.readouterr().err.strip().splitlines()[-1]
-    assert said in error and len(error) < 300
