@@ -18,8 +18,9 @@ from .numerics import concrete
 # XLA's newer fusion emitters for CPUs take twice as long to compile large programs, which run no
 # faster.
 LARGE = {"xla_cpu_use_fusion_emitters": False}
-# For large programs that run once.
-ONCE = {**LARGE, "xla_backend_optimization_level": 0}
+# For large programs that run once. Level 0 compiles no faster, and gave one program of second
+# derivatives a gradient that was wrong in the fifth digit, and Hessians that were NaN.
+ONCE = {**LARGE, "xla_backend_optimization_level": 1}
 # A preset of compiler passes with which a RED-Net step takes a tenth less time
 # (docs/performance.md).
 NETWORK = {"xla_cpu_opt_preset": "CPU_OPT_PRESET_FAST_COMPILE"}

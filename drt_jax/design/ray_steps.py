@@ -29,12 +29,13 @@ from .within_limits import within_limits
 
 class RayState(NamedTuple):
     """State of `RaySteps`: number of steps, (); running means of the gradient, (N,), and of its
-    square in the metric, (); the metric B, (N, N), mm^2."""
+    square in the metric, (); the metric B, (N, N), mm^2, and the RMS spot, (), mm, made with it."""
 
     steps: Array
     first: Array
     second: Array
     metric: Array
+    spot: Array
 
 
 def cosine(size: float, steps: int, warm: int = 10) -> Callable[[Array], Array]:
@@ -57,6 +58,8 @@ class RaySteps:
     limits: problem whose bounds and limits hold, in the metric of the rays, see `within_limits`.
     size: mm, root mean square over all rays, by which a step moves the hits; or a function of the
         number of the step, such as `cosine`.
+    share: of the RMS spot, that no step exceeds: a lens whose spots are far smaller than `size`
+        keeps them.
     damping: of directions that hardly move rays.
     every: number of steps after which the metric is made anew.
     b1, b2: decay rates of the means.
@@ -65,6 +68,7 @@ class RaySteps:
     spots: Problem
     limits: Problem
     size: float | Callable[[Array], Array]
+    share: float = 0.2
     damping: float = 1e-3
     every: int = 10
     b1: float = 0.9
@@ -72,23 +76,30 @@ class RaySteps:
 
     def init(self, vector: Array) -> RayState:
         """The state before the first step."""
-        one = jnp.eye(len(vector), dtype=vector.dtype)
-        return RayState(jnp.zeros((), jnp.int32), 0 * vector, jnp.zeros((), vector.dtype), one)
+        one, steps = jnp.eye(len(vector), dtype=vector.dtype), jnp.zeros((), jnp.int32)
+        return RayState(steps, 0 * vector, 0 * vector[0], one, 0 * vector[0])
 
-    def metric(self, vector: Array) -> Array:
-        """B, (N, N), mm^2, at a vector."""
+    def metric(self, vector: Array) -> tuple[Array, Array]:
+        """B, (N, N), mm^2, and the RMS spot, (), mm, at a vector."""
         spots = self.spots.with_solver(solve_aimed)
-        slopes = jax.jacfwd(lambda v: spots.evaluate(v).residuals)(vector)
-        square = matmul(slopes.T, slopes) / (len(spots.fields) * len(spots.distances))
+        views = len(spots.fields) * len(spots.distances)
+
+        def hits(vector: Array) -> tuple[Array, Array]:
+            residuals = spots.evaluate(vector).residuals
+            return residuals, safe_sqrt(jnp.vdot(residuals, residuals) / views)
+
+        slopes, spot = jax.jacfwd(hits, has_aux=True)(vector)
+        square = matmul(slopes.T, slopes) / views
         diagonal = jnp.diagonal(square)
         # A variable that moves no ray stays: it has no gradient either.
         idle = jnp.where(diagonal > 0, self.damping * diagonal, jnp.max(diagonal))
-        return square + jnp.diag(idle)
+        return square + jnp.diag(idle), spot
 
     def update(self, gradient: Array, state: RayState, vector: Array) -> tuple[Array, RayState]:
         """The next vector (N,), and the next state. Works in `jit`."""
         renew = state.steps % self.every == 0
-        metric = jax.lax.cond(renew, self.metric, lambda _: state.metric, vector)
+        old = lambda _: (state.metric, state.spot)  # noqa: E731
+        metric, spot = jax.lax.cond(renew, self.metric, old, vector)
         gradient = gradient.astype(vector.dtype)
         square = jnp.vdot(gradient, jnp.linalg.solve(metric, gradient))
         first = self.b1 * state.first + (1 - self.b1) * gradient
@@ -97,6 +108,6 @@ class RaySteps:
         length = safe_sqrt(second / bias[1])
         unit = safe_divide(jnp.linalg.solve(metric, first) / bias[0], length)
         k = state.steps.astype(vector.dtype)
-        size = self.size(k) if callable(self.size) else self.size
+        size = jnp.minimum(self.size(k) if callable(self.size) else self.size, self.share * spot)
         new = within_limits(self.limits, vector, vector - size * unit, metric)
-        return new, RayState(state.steps + 1, first, second, metric)
+        return new, RayState(state.steps + 1, first, second, metric, spot)

@@ -99,6 +99,22 @@ def test_a_step_moves_the_rays_by_its_size_and_no_unit_counts(triplet):
 
 
 @pytest.mark.slow
+def test_no_step_exceeds_a_share_of_the_spots(triplet):
+    """Steps far above the spots led a phone lens away from spots of 0.1 um."""
+    spots, limits = triplet
+    start = spots.variables.start
+    gradient = jax.grad(spots.merit)(start + 0.01)
+    residuals = lambda v: spots.evaluate(v).residuals  # noqa: E731
+    spot = jnp.linalg.norm(residuals(start)) / len(spots.fields) ** 0.5
+    steps = design.RaySteps(spots, limits, 1.0, share=0.01, damping=1e-6)
+    new, state = jax.jit(steps.update)(gradient, steps.init(start), start)
+    _, moved = jax.jvp(residuals, (start,), (new - start,))
+    assert float(state.spot) == pytest.approx(float(spot), rel=1e-9)
+    length = jnp.linalg.norm(moved) / len(spots.fields) ** 0.5
+    assert float(length / spot) == pytest.approx(0.01, rel=0.05)
+
+
+@pytest.mark.slow
 def test_it_ends_where_least_squares_ends_within_bounds_and_limits(triplet):
     """From a spoilt lens, by exact gradients of the spots."""
     spots, limits = triplet

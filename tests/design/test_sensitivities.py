@@ -144,6 +144,27 @@ def test_transfer_as_criterion_is_that_of_the_refocused_lens(singlet):
 
 
 @pytest.mark.slow
+def test_second_derivatives_of_a_transfer_function():
+    """Compiled without any optimisation, this program gave NaN."""
+    lens = design.open_apertures(drt_jax.load_lens("cooke_triplet"))
+    some = PerturbedLens.from_lens(lens, lens.semi_diameter[:-1], [Tolerance("radius", 0.05)])
+    variables = Variables.from_lens(some.lens, ["sensor"])
+    problem = Problem.from_variables(variables, ["spot"], Scene.degrees(10, np.inf, [0.5876]))
+    sharp = Operand("mtf", target=1, at=30.0)
+    predicted = design.predict(problem, some, Assembly([Tolerance("sensor", 1.0)], sharp))
+    sensor = some.lens.sensor + predicted.moves[0]
+    some = dataclasses.replace(some, lens=dataclasses.replace(some.lens, sensor=sensor))
+    rows = np.concatenate([np.zeros((1, 6)), 0.02 * np.eye(6), -0.02 * np.eye(6)])
+    values = design.monte_carlo(problem, some, rows, Assembly("none", sharp)).value
+    none, plus, minus = np.split(np.asarray(values), [1, 7])
+    slope, bend = (plus - minus) / 0.04, (plus + minus - 2 * none) / 4e-4
+    held = predicted.before
+    np.testing.assert_allclose(held.gradient, slope, atol=1e-3 * np.max(np.abs(slope)))
+    diagonal = np.diag(np.asarray(held.hessian))
+    np.testing.assert_allclose(diagonal, bend, atol=0.01 * np.max(np.abs(bend)))
+
+
+@pytest.mark.slow
 def test_inverse_sensitivity_keeps_the_drop(singlet):
     problem, some = singlet
     drop = 2e-3
