@@ -69,7 +69,7 @@ ROOMS = {
 PUBLIC = 60
 # Outside packages that belong to some modules or floors alone.
 ONLY = {
-    "optimistix": {"rays.aim", "image.field"},
+    "optimistix": {"rays.aim", "rays.find", "image.field"},
     "matplotlib": {"show"},
     "skimage": {"learn.data", "learn.train"},
     "PIL": {"learn.images"},
