@@ -53,7 +53,7 @@ ROOMS = {
     "drt_jax/files": 3120,
     "drt_jax/image": 3018,
     "drt_jax/learn": 655,
-    "drt_jax/lens": 1879,
+    "drt_jax/lens": 1881,
     "drt_jax/pupil": 776,
     "drt_jax/rays": 1312,
     "drt_jax/show": 1437,

@@ -58,7 +58,7 @@ def crossed(lens: Lens) -> str:
     do."""
     pairs = neighbours_now(lens)
     places = zip(pairs, crossings(lens, pairs), strict=True)
-    parts = [describe_crossing(pair, place) for pair, place in places if place is not None]
+    parts = [describe_crossing(lens, pair, place) for pair, place in places if place is not None]
     return "".join(f"; {part}" for part in parts[:_PARTS])
 
 
@@ -67,7 +67,7 @@ def check_order(lens: Lens) -> None:
     order."""
     for pair in neighbours_now(lens):
         if pair.gap <= 0 and pair.second < lens.count:
-            raise ValueError(f"{describe_crossing(pair, 0.0)}; light cannot go backwards")
+            raise ValueError(f"{describe_crossing(lens, pair, 0.0)}; light cannot go backwards")
 
 
 @functools.partial(jit, wanted=ONCE)

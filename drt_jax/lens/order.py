@@ -125,11 +125,13 @@ def neighbours_now(lens: Lens) -> list[Pair]:
     return neighbours(lens, [*gaps, float(lens.sensor) - sum(gaps)], moved)
 
 
-def describe_crossing(pair: Pair, place: float) -> str:
+def describe_crossing(lens: Lens, pair: Pair, place: float) -> str:
     """A sentence that says that two neighbours cross.
 
     place: height where they cross, mm, see `crossings`.
     """
     where = f"at y = {place:.4g} mm" if place else "on the axis"
     both = f"surfaces {pair.first} and {pair.second}"
+    if pair.second == lens.count:
+        both = f"surface {pair.first} and the sensor"
     return f"{both} cross {where}: {pair.gap:.4g} mm between their vertices"
