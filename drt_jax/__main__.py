@@ -26,17 +26,17 @@ def _options(argv: list[str] | None) -> argparse.Namespace:
     commands = parser.add_subparsers(required=True, metavar="show, convert, glass or check")
 
     def command(
-        name: str, told: Callable[[argparse.Namespace], Iterator[show.Line]], about: str
+        name: str, output: Callable[[argparse.Namespace], Iterator[show.Line]], about: str
     ) -> argparse.ArgumentParser:
-        """A parser; `told` makes the lines of output of its options."""
+        """A parser; `output` makes the lines that are printed of its options."""
         added = commands.add_parser(name, help=about, description=about)
-        added.set_defaults(told=told)
+        added.set_defaults(output=output)
         return added
 
     about = (
         "first-order data, spots over the field, share of light, warnings, and a sheet of analyses"
     )
-    show.arguments(command("show", lambda options: show.told(options, _show_task), about))
+    show.arguments(command("show", lambda options: show.output(options, _show_task), about))
     about = "write a lens as a file of another program; says what is not in it"
     convert = command("convert", converted, about)
     convert.add_argument("lens", help=".yaml, .zmx or .seq file, or a bundled name")
@@ -44,9 +44,9 @@ def _options(argv: list[str] | None) -> argparse.Namespace:
     convert.add_argument("--configuration", type=int, help=show.WHICH)
     convert.add_argument("--missing", choices=("error", "warn"), default="error", help=show.MISSING)
     about = "index, Abbe number, partial dispersion, range and source of a glass, its neighbours"
-    glasses.arguments(command("glass", glasses.told, about))
+    glasses.arguments(command("glass", glasses.output, about))
     about = "eleven scenes against numbers of other programs; exit status 1 if one is wrong"
-    check.arguments(command("check", lambda options: check.told(options, _show_task), about))
+    check.arguments(command("check", lambda options: check.output(options, _show_task), about))
     return parser.parse_args(argv)
 
 
@@ -108,7 +108,7 @@ def main(argv: list[str] | None = None) -> None:
         set_up()
         options = _options(argv)
         with _warnings_on_stdout():
-            for line in options.told(options):
+            for line in options.output(options):
                 _print_line(line)
     except KeyboardInterrupt:
         sys.stderr.write("stopped\n")

@@ -4,6 +4,7 @@ The table NAME of an experiment replaces the block between `<!-- table: NAME -->
 `<!-- end -->`.
 """
 
+import argparse
 import pathlib
 import re
 
@@ -48,8 +49,9 @@ def filled(text: str, tables: dict[str, str]) -> str:
     return _BLOCK.sub(block, text)
 
 
-def main() -> None:
+def main(argv: list[str] | None = None) -> None:
     """Command line."""
+    argparse.ArgumentParser(description=__doc__).parse_args(argv)
     experiments.left = lambda: "pages are whole"
     tables = all_tables()
     for page in pages():

@@ -57,7 +57,7 @@ ROOMS = {
     "drt_jax/pupil": 776,
     "drt_jax/rays": 1312,
     "drt_jax/show": 1437,
-    "experiments": 486,
+    "experiments": 487,
     "experiments/designing": 881,
     "experiments/imaging": 452,
     "experiments/paper": 599,

@@ -135,7 +135,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--json", type=pathlib.Path, help="a file for all of it, for a bug report")
 
 
-def told(options: argparse.Namespace, say: Callable[[str], None]) -> Iterator[str]:
+def output(options: argparse.Namespace, say: Callable[[str], None]) -> Iterator[str]:
     """The scenes compared with their truth, as lines of a table; SystemExit with 1 if one is wrong.
     say: called with the name of each step."""
     names = options.scenes or [*TRUTHS]

@@ -9,8 +9,9 @@ from typing import Literal, NamedTuple
 
 from ..inputs import require_one_of
 from ..lens.lens import Lens
+from .deviations import KINDS, ToleranceKind
 from .media import pieces_of
-from .perturbed import KINDS, Tolerance, ToleranceKind
+from .perturbed import Tolerance
 
 GradeName = Literal[
     "commercial", "precision", "high precision", "moulded", "moulded precision", "turned",

@@ -11,7 +11,8 @@ from ..inputs import require
 from ..numerics import Numbers
 from .assembly import Assembly, Given
 from .configurations import AnyProblem
-from .perturbed import KINDS, Deviation, PerturbedLens
+from .deviations import KINDS
+from .perturbed import Deviation, PerturbedLens
 from .tolerance import Predicted, monte_carlo
 
 # Operands in units other than mm or none: a factor and the unit in which a table shows them.

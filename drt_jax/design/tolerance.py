@@ -26,8 +26,9 @@ from ..rays.solve import solve_aimed
 from .assembly import Assembly, Given, mean_of
 from .compensation import AsBuilt, Compensator, compensated
 from .configurations import AnyProblem, over, shares_of
+from .deviations import KINDS
 from .field_rays import FieldRays, symmetry_by_structure, trace_views
-from .perturbed import KINDS, PerturbedLens
+from .perturbed import PerturbedLens
 from .problem import Problem, trace_fields
 from .tiles import in_tiles
 

@@ -69,7 +69,7 @@ def configuration(text: str) -> int | str:
     return text if text == "all" else int(text)
 
 
-def told(options: argparse.Namespace, say: Callable[[str], None]) -> Iterator[Line]:
+def output(options: argparse.Namespace, say: Callable[[str], None]) -> Iterator[Line]:
     """Data of a lens as they are computed, as lines and rows of tables; and draws its sheet.
     ValueError for wrong options. say: called with the name of each step."""
     if not all(abs(field) < 90 for field in options.field or ()):

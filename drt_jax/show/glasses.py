@@ -22,7 +22,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--plot", type=pathlib.Path, metavar="FILE.png", help="the glass map")
 
 
-def told(options: argparse.Namespace) -> Iterator[str]:
+def output(options: argparse.Namespace) -> Iterator[str]:
     """Lines of output of the command, which also writes the map. ValueError for wrong options."""
     if (options.name is None) == (options.near is None):
         raise ValueError("give the name of a glass or --near ND,VD, one of both")

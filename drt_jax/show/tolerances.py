@@ -7,7 +7,7 @@ from jax.typing import ArrayLike
 from matplotlib.axes import Axes
 
 from ..design import Sensitivity
-from ..design.perturbed import KINDS
+from ..design.deviations import KINDS
 
 _LARGEST = 2.0  # bars are cut at this many times the largest change after compensation
 

@@ -31,7 +31,7 @@ from tqdm import tqdm
 
 import drt_jax
 from drt_jax import Scene, design
-from drt_jax.design.perturbed import KINDS
+from drt_jax.design.deviations import KINDS
 from drt_jax.design.tolerance import Order
 
 from . import _command, _common, _plots, _sharing

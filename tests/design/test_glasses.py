@@ -38,23 +38,25 @@ def thin(crown, flint):
     return np.mean((power * u + (1 - power) * w) ** 2), power
 
 
+VARY = [
+    Vary("curvature"),
+    Vary("index", (0,), low=1.45, high=1.60),
+    Vary("index", (1,), low=1.55, high=1.70),
+    Vary("abbe", (0,), low=60, high=70),
+    Vary("abbe", (1,), low=35, high=45),
+    "sensor",
+]
+
+
 @functools.cache
 def snapped():
     """The optimum of a slow doublet of model glasses, its real glasses, and what that compiled."""
     lens = drt_jax.load_lens(DOUBLET)
-    vary = [
-        Vary("curvature"),
-        Vary("index", (0,), low=1.45, high=1.60),
-        Vary("index", (1,), low=1.55, high=1.70),
-        Vary("abbe", (0,), low=60, high=70),
-        Vary("abbe", (1,), low=35, high=45),
-        "sensor",
-    ]
     solves = [Solve("focal_length", FOCAL, surface=2, wavelengths=(WAVES[1],))]
     operands = [Operand("spot", weight=1e3), Operand("glass_map", high=0.0)]
     operands.append(Operand("total_track", high=200.0))
     problem = design.Problem.from_variables(
-        Variables.from_lens(lens, vary, solves=solves),
+        Variables.from_lens(lens, VARY, solves=solves),
         operands,
         Scene.radians(0.0, wavelengths=WAVES),
         2,
@@ -210,18 +212,10 @@ def thin_by_day_and_night(crown, flint):
 def test_one_pair_of_glasses_serves_all_configurations():
     """A slow doublet by day and by night, refocused: each exchange as thin lenses have it."""
     lens, problems = drt_jax.load_lens(DOUBLET), []
-    vary = [
-        Vary("curvature"),
-        Vary("index", (0,), low=1.45, high=1.60),
-        Vary("index", (1,), low=1.55, high=1.70),
-        Vary("abbe", (0,), low=60, high=70),
-        Vary("abbe", (1,), low=35, high=45),
-        "sensor",
-    ]
     focal = Operand("effective_focal_length", low=FOCAL - 1e-3, high=FOCAL + 1e-3)
     for lines in LINES:
         scene = Scene.radians(0.0, wavelengths=lines)
-        own = Variables.from_lens(lens, vary)
+        own = Variables.from_lens(lens, VARY)
         own_operands = [Operand("spot", weight=1e3), *([focal] if lines is WAVES else [])]
         problems.append(design.Problem.from_variables(own, own_operands, scene, 2))
     both = design.Configurations.from_problems(problems, ["sensor"])

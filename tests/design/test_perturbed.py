@@ -10,7 +10,7 @@ import pytest
 
 import drt_jax
 from drt_jax.design import PerturbedLens, Tolerance, elements_of
-from drt_jax.design.perturbed import KINDS
+from drt_jax.design.deviations import KINDS
 from drt_jax.lens.glass import refractive_index
 from drt_jax.lens.lens import sag
 

@@ -13,7 +13,7 @@ from scipy import optimize
 import drt_jax
 from drt_jax import Scene, design
 from drt_jax.design import PerturbedLens, Problem, Tolerance, Variables, tolerance
-from drt_jax.design.perturbed import KINDS
+from drt_jax.design.deviations import KINDS
 from drt_jax.design.tolerance import Order
 from drt_jax.pupil.rules import Gauss
 

@@ -315,5 +315,5 @@ def test_benchmark_starts_new_processes():
 
 
 def test_tables_has_nothing_to_write(capsys):
-    tables.main()
+    tables.main([])
     assert capsys.readouterr().out == ""
