@@ -49,7 +49,7 @@ ALLOWED_ALL = {"learn.__init__", *(f"show.{name}" for name in _DRAWN)}
 ROOMS = {
     "drt_jax": 367,
     "drt_jax/check": 329,
-    "drt_jax/design": 3336,
+    "drt_jax/design": 3337,
     "drt_jax/files": 3120,
     "drt_jax/image": 3018,
     "drt_jax/learn": 655,

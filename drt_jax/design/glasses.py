@@ -113,6 +113,22 @@ def _places(problem: Problem) -> list[tuple[int, ...]]:
     return [tuple(r for r in first if first[r] == row) for row in sorted({*first.values()})]
 
 
+def _shared_places(problem: AnyProblem) -> list[tuple[int, ...]]:
+    """`_places` of all configurations.
+
+    ValueError for configurations at other temperatures, or with glasses of their own.
+    """
+    each = problems_of(problem)
+    cold = all(one.variables.environment is None for one in each)
+    require(cold, "problem: snap_glasses takes one at 20 C, where its glasses are those of makers")
+    places = _places(each[0])
+    apart = [n for n in problem.variables.names if re.match(r"(index|abbe) .* of configuration", n)]
+    alike = not apart and all(_places(one) == places for one in each)
+    own = ", ".join(apart) or "their model glasses differ"
+    require(alike, f"problem: snap_glasses: {own}; one glass serves all configurations: share it")
+    return places
+
+
 def _with_glass(
     problem: AnyProblem, vector: np.ndarray, place: tuple[int, ...], glass: Glass
 ) -> tuple[AnyProblem, np.ndarray]:
@@ -220,14 +236,7 @@ def snap_glasses(
             search = take_step(tried, search)
         return _Trial(place, near, own, np.asarray(search.vector), float(search.score))
 
-    each = problems_of(problem)
-    cold = all(one.variables.environment is None for one in each)
-    require(cold, "problem: snap_glasses takes one at 20 C, where its glasses are those of makers")
-    places, snaps = _places(each[0]), list[Snap]()
-    apart = [n for n in problem.variables.names if re.match(r"(index|abbe) .* of configuration", n)]
-    alike = not apart and all(_places(one) == places for one in each)
-    own = ", ".join(apart) or "their model glasses differ"
-    require(alike, f"problem: snap_glasses: {own}; one glass serves all configurations: share it")
+    places, snaps = _shared_places(problem), list[Snap]()
     left, done = [*places], False
     while not done:
         tasks = [
@@ -253,9 +262,7 @@ def snap_glasses(
     alternatives = {p[0]: [(t.near, t.score) for t in ranked if t.place == p] for p in places}
     # In the lens of the variables, nd and vd of media without a model are exact; in `found.lens`
     # they have passed through the vector.
-    ends = [found.lens]
-    if isinstance(problem, Configurations):
-        ends = [*problem.lenses(found.vector)]
+    ends = problem.lenses(found.vector) if isinstance(problem, Configurations) else (found.lens,)
     lens, *more = (
         dataclasses.replace(end, dispersion=one.variables.lens.dispersion)
         for end, one in zip(ends, problems_of(problem), strict=True)
