@@ -26,12 +26,14 @@ main { display: grid; gap: 0 2rem; grid-template-columns: minmax(0, 1fr) }
   main { grid-template-columns: repeat(2, minmax(0, 1fr)) } .both { grid-column: 1 / -1 }
 }
 figure { margin: 0; background: white; overflow-x: auto; color: black }
-figure :is(img, svg) { width: 100%; height: auto } .both figure :is(img, svg) { min-width: 40rem }
+figure :is(img, svg) { width: 100%; height: auto }
 .wide { overflow-x: auto } pre { overflow-x: auto; font-size: .85rem }
 table { border-collapse: collapse; font-variant-numeric: tabular-nums }
-th, td { padding: .2rem .7rem; text-align: left; white-space: nowrap }
-th { white-space: normal; vertical-align: bottom }
+th, td { padding: .2rem .7rem; text-align: left } th { vertical-align: bottom }
 tr { border-bottom: 1px solid #8885 }
+@media (max-width: 40rem) {
+  body { padding: .4rem } th, td { padding: .2rem .25rem; font-size: .75rem; hyphens: auto }
+}
 """
 
 
@@ -48,7 +50,7 @@ def page(title: str, parts: Sequence[tuple[str, Part]]) -> str:
     head = '<meta charset="utf-8"><meta name="viewport" content="width=device-width">'
     head += f"<title>{html.escape(title)}</title><style>{_STYLE}</style>"
     return (
-        f"<!doctype html>\n<html><head>{head}</head>\n<body>\n"
+        f'<!doctype html>\n<html lang="en"><head>{head}</head>\n<body>\n'
         + "\n".join(body)
         + "\n</main></body></html>\n"
     )

@@ -15,7 +15,7 @@ from drt_jax.__main__ import main
 BROWSER = next(
     filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), ""
 )
-WIDTHS = (1280, 500)
+WIDTHS = (1920, 1280, 500)
 KEPT = pathlib.Path(__file__).parents[2] / "results" / "pages"
 
 
@@ -97,8 +97,8 @@ def test_a_lens_can_be_typed_in_again():
 
 @pytest.mark.slow
 @pytest.mark.skipif(not BROWSER, reason="no browser: apt-get install chromium")
-def test_a_browser_shows_the_sheet_at_two_widths(tmp_path, capsys, write_tables):
-    """Every analysis is drawn, and nothing but tables reaches beyond the screen. With
+def test_a_browser_shows_the_sheet_at_three_widths(tmp_path, capsys, write_tables):
+    """Every analysis is drawn, and nothing reaches beyond the screen or its own frame. With
     --write-tables the pictures are kept in results/pages."""
     page = tmp_path / "lens.html"
     words = ["show", "cooke_triplet", "--html", "--field", "0", "14", "20", "--out", str(page)]
@@ -108,13 +108,18 @@ def test_a_browser_shows_the_sheet_at_two_widths(tmp_path, capsys, write_tables)
     for title in ("First-order data", "Surfaces", "Layout", "Spots", "Lateral colour"):
         assert f"<h2>{title}</h2>" in text
     assert len(text) < 900_000  # small enough to mail
-    told = "<script>document.body.dataset.wide = document.documentElement.scrollWidth</script>"
+    told = """<script>
+    const data = document.body.dataset, all = [...document.querySelectorAll(".wide, figure, pre")];
+    data.wide = document.documentElement.scrollWidth;
+    data.cut = all.filter(e => e.scrollWidth > e.clientWidth).length;
+    </script>"""
     measured = tmp_path / "measured.html"
     measured.write_text(text.replace("</body>", told + "</body>"))
     for width in WIDTHS:
         size, shot = f"--window-size={width},3000", tmp_path / f"{width}.png"
         dom = browse(size, "--dump-dom", measured.as_uri())
         assert int(re.search(r'data-wide="(\d+)"', dom)[1]) <= width
+        assert int(re.search(r'data-cut="(\d+)"', dom)[1]) == 0
         browse(size, f"--screenshot={shot}", page.as_uri())
         seen = np.asarray(Image.open(shot).convert("L"))
         assert seen.shape[1] == width
