@@ -11,7 +11,7 @@ import fnmatch
 import math
 import sys
 import time
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -23,35 +23,14 @@ from drt_jax.design import Operand, Solve, Tie, Vary
 from drt_jax.design.growth import SHORTEST, grow_once, start_growth
 from drt_jax.lens.glasses import glass_makers, nearest_glasses
 
-from . import _command, _common, _sharing
+from . import _command, _common
 from ._common import not_empty, require, require_known, within
 from ._design_report import draw as draw, tables as tables
+from ._searches import Progress, Starts, searched, starts_of as starts_of
 from .runs.folder import Run
 
 COLUMNS = ("merit", "worst", "jacobians")
 _DRAWN = 6  # most minima that are drawn
-
-
-@dataclasses.dataclass(frozen=True)
-class Starts:
-    """Starts of the search.
-
-    count: number of searches.
-    how: "normal", about the lens; "sobol", within the bounds; "as_built", lenses with errors.
-    spread: of "normal", standard deviation in scales of the variables.
-    per_cent, off_mm: of "as_built", standard deviations of curvatures and thicknesses.
-    stages: trials of each search in each stage.
-    keep: fraction of searches that survive a stage.
-    """
-
-    count: Annotated[int, within(1, 1e5)] = 1
-    how: Literal["normal", "sobol", "as_built"] = "normal"
-    spread: Annotated[float, within(0, 1e3)] = 1.0
-    per_cent: float = 1.0
-    off_mm: float = 0.1
-    stages: Annotated[tuple[int, ...], within(1, 1e4), not_empty] = (12, 12, 24, 48, 200)
-    keep: Annotated[float, within(0, 1)] = 0.7
-    seed: int = 0
 
 
 @dataclasses.dataclass(frozen=True)
@@ -171,25 +150,6 @@ def order_of(config: Config, lens: drt_jax.Lens) -> int:
     return getattr(rule, "order", config.order)
 
 
-class _Progress(tqdm):
-    """A progress bar with the merit and the worst limit."""
-
-    def __init__(self, title: str, total: int):
-        super().__init__(total=total, desc=title, unit="trial", dynamic_ncols=True)
-
-    def searched(self, search: design.Search) -> None:
-        """Shows one trial."""
-        self.update()
-        worst = f"worst limit={float(search.max_violation):+.2g}"
-        self.set_postfix_str(f"merit={float(search.merit):.6g} {worst}")
-
-    def tiles(self, done: int, total: int, best: float) -> None:
-        """Shows one tile of many starts."""
-        self.total = total
-        self.update(done - self.n)
-        self.set_postfix_str(f"best={best:.6g}")
-
-
 def grown(config: Config, problem: design.Problem, run: Run) -> drt_jax.Lens:
     """Designs the lens for growing parts of field and aperture. ConfigError, with the reason and
     the remedy, if growth stops."""
@@ -200,7 +160,7 @@ def grown(config: Config, problem: design.Problem, run: Run) -> drt_jax.Lens:
     if saved is not None:
         growth = growth._replace(**saved | {"vector": np.array(saved["vector"])})
     while not growth.ended:
-        with _Progress(f"{growth.part:.1%} of field and aperture", settings.trials) as bar:
+        with Progress(f"{growth.part:.1%} of field and aperture", settings.trials) as bar:
             growth = grow_once(problem, growth, target, settings.trials, bar.searched)
         run.keep("growth", growth._asdict() | {"vector": growth.vector.tolist(), "failed": None})
     if growth.done < 1:
@@ -215,48 +175,9 @@ def grown(config: Config, problem: design.Problem, run: Run) -> drt_jax.Lens:
     return problem.variables.lens_of(jnp.asarray(growth.vector))
 
 
-def starts_of(variables: design.Variables, starts: Starts) -> np.ndarray:
-    """Vectors (K, N) of the starts."""
-    count, seed = starts.count, starts.seed
-    if count == 1:
-        return np.asarray(variables.start)[None]
-    if starts.how == "as_built":
-        return design.as_built_starts(variables, count, starts.per_cent, starts.off_mm, seed)
-    if starts.how == "normal":
-        return design.normal_starts(variables, count, starts.spread, seed)
-    return design.sobol_starts(variables, count, seed)
-
-
-def searched(config: Config, problem: design.Problem) -> dict[str, Any]:
-    """Vectors at the ends of the searches from the starts, best first, with counts and times."""
-    variables, starts = problem.variables, config.starts
-    if starts.count == 1:
-        nothing = {"trials": 0, "jacobians": 0, "seconds": 0.0, "compile_s": 0.0}
-        return {"vectors": [variables.start.tolist()], "merits": [], "no_worse": None} | nothing
-    vectors = starts_of(variables, starts)
-    mesh = _sharing.mesh_of(config.devices)
-    with _Progress(f"{starts.count} starts", 1) as bar:
-        how = starts.stages, starts.keep, bar.tiles
-        found = design.many_starts(problem, vectors, *how, mesh=mesh)
-    require(len(found.minima) > 0, "starts: no ray passes any of them; widen the bounds")
-    return {
-        "vectors": [minimum.vector.tolist() for minimum in found.minima],
-        "merits": [minimum.merit for minimum in found.minima],
-        "no_worse": int(np.sum(found.merits <= float(problem.merit(variables.start)))),
-        "count": starts.count,
-        "found": [minimum.found for minimum in found.minima],
-        "passed": int(np.isfinite(found.merits).sum()),
-        "trials": found.steps,
-        "jacobians": found.jacobians,
-        "seconds": found.seconds - found.compile_s,
-        "compile_s": found.compile_s,
-        "best": found.best,
-    }
-
-
 def finished(config: Config, problem: design.Problem, found: dict[str, Any]) -> dict[str, Any]:
     """Optimises the best vector with the rule that it needs."""
-    with _Progress("least squares", config.trials) as bar:
+    with Progress("least squares", config.trials) as bar:
         vector = jnp.asarray(found["vectors"][0])
         parts = [design.optimise(problem, vector, config.trials, bar.searched)]
         order = config.order if config.rings else order_of(config, parts[0].lens)
@@ -325,7 +246,7 @@ def run(config: Config, run: Run) -> dict[str, Any]:
     first = problem_of(config, start)
     begin = grown(config, first, run) if config.growth.first < 1 else start
     problem = problem_of(config, begin)
-    found = run.once("starts", lambda: searched(config, problem))
+    found = run.once("starts", lambda: searched(problem, config.starts, config.devices))
     end = run.once("finish", lambda: finished(config, problem, found))
     history = np.array(end["history"])
     run.log("least squares", 0, dict(zip(COLUMNS, history.T)))

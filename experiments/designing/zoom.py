@@ -2,9 +2,9 @@
 
 The settings name what moves, with a value of its own in each configuration, and what all share.
 Writes the lens of each configuration, before and after, as YAML, and results.json: `rows` with
-`configuration`, `focal_mm`, `merit_start`, `merit_moved` (only what moves is optimised),
-`merit_end`, and `spots_um` of start and end; with near objects also `magnification` and `breathing`
-of start and end.
+`configuration`, `focal_mm`, `merit_start`, `merit_moved` (only what moves is optimised; of many
+starts `merit_starts`, the best of them), `merit_end`, and `spots_um` of start and end; with near
+objects also `magnification` and `breathing` of start and end.
 """
 
 import dataclasses
@@ -24,11 +24,14 @@ from drt_jax.design import Operand, Vary
 from drt_jax.design.operands import OperandName
 from drt_jax.files.load import System
 
-from . import _command, _common, _plots
+from . import _command, _common, _plots, _searches
 from ._common import not_empty, require, within
+from ._searches import Starts
 from .runs.folder import Run
 
 COLUMNS = ("merit", "worst", "jacobians")
+# What is kept of many starts; a start is good whose spots are at most so many times the best.
+_KEPT, _GOOD = ("count", "passed", "scores", "trials", "seconds", "compile_s"), (1.1, 1.5, 2.0)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -37,10 +40,12 @@ class Keep:
 
     kind: an operand without rays; the magnification of near objects alone.
     per_cent: by how much its value may change.
+    values: one for each configuration; empty for those of the file.
     """
 
     kind: OperandName
     per_cent: Annotated[float, within(1e-6, 1e3)] = 1.0
+    values: tuple[float, ...] = ()
 
 
 @dataclasses.dataclass(frozen=True)
@@ -56,6 +61,7 @@ class Config:
     order: order of the pupil rule.
     tolerance: relative error of the spots.
     trials: most trials of a search.
+    starts: more than one: searches from many starts, the best of which is finished.
     """
 
     lens: str = "configs/design/lenses/us5568323.zmx"
@@ -67,11 +73,15 @@ class Config:
     order: Annotated[int, within(1, 40)] = 4
     tolerance: Annotated[float, within(1e-12, 0.5)] = 1e-3
     trials: Annotated[int, within(1, 1e5)] = 600
+    starts: Starts = Starts()
 
 
-def problem_of(config: Config, system: System, vary: tuple[Vary, ...]) -> design.Problem:
+def problem_of(
+    config: Config, system: System, vary: tuple[Vary, ...], number: int = 0
+) -> design.Problem:
     """The problem of one configuration. It keeps its f-number by a solve of its stop; what else it
-    keeps are limits about the values at the start; no magnification of an object at infinity."""
+    keeps are limits about the values of the settings or at the start; no magnification of an object
+    at infinity. number: of the configuration, from 0."""
     wave = float(system.wavelengths[system.primary])
     solve = design.Solve("f_number", distance=system.distance, wavelengths=(wave,))
     lens = design.open_apertures(system.lens)
@@ -80,6 +90,7 @@ def problem_of(config: Config, system: System, vary: tuple[Vary, ...]) -> design
     for keep in (keep for keep in config.keep if not (far and keep.kind == "magnification")):
         alone = design.Problem.from_variables(variables, [keep.kind], system.scene)
         (value,) = np.asarray(alone.evaluate(variables.start).residuals).tolist()
+        value = keep.values[number] if keep.values else value
         most = 0.01 * keep.per_cent * abs(value)
         kept.append(Operand(keep.kind, low=value - most, high=value + most))
     operands = (*config.operands, *kept)
@@ -90,16 +101,19 @@ def zoom_of(
     config: Config, systems: list[System], shared: tuple[Vary, ...]
 ) -> design.Configurations:
     """The problem of all configurations."""
-    problems = [problem_of(config, system, (*config.moving, *shared)) for system in systems]
+    vary = (*config.moving, *shared)
+    problems = [problem_of(config, system, vary, k) for k, system in enumerate(systems)]
     lens = problems[0].variables.lens
     own = [str(place) for vary in config.moving for place in vary.places(lens)]
     return design.Configurations.from_problems(problems, own, config.weights or None)
 
 
-def searched(config: Config, zoom: design.Configurations, run: Run, job: str) -> dict[str, Any]:
-    """The end of a search from the start: its vector, merits, limit and time."""
+def searched(
+    config: Config, zoom: design.Configurations, run: Run, job: str, vector: Any = None
+) -> dict[str, Any]:
+    """The end of a search from a vector, or the start: its vector, merits, limit and time."""
     begun = time.perf_counter()
-    found = design.optimise(zoom, max_steps=config.trials)
+    found = design.optimise(zoom, vector, max_steps=config.trials)
     run.log(job, 0, dict(zip(COLUMNS, found.history.T)))
     return {
         "vector": found.vector.tolist(),
@@ -127,16 +141,25 @@ def run(config: Config, run: Run) -> dict[str, Any]:
     count = range(1, first.configurations + 1)
     systems = [drt_jax.load_system(config.lens, configuration=k) for k in count]
     require(len(systems) > 1, f"lens: {config.lens} has one configuration; give several")
-    moved, zoom = zoom_of(config, systems, ()), zoom_of(config, systems, config.shared)
-    ends = {}
-    for name, problem in (("moved", moved), ("designed", zoom)):
-        ends[name] = run.once(name, lambda: searched(config, problem, run, name))
-    begin = zoom.variables.start
+    for keep in config.keep:
+        fits = len(keep.values) in (0, len(systems))
+        require(fits, f"keep: {keep.kind}: values: give one for each of {len(systems)}, or none")
+    zoom, ends = zoom_of(config, systems, config.shared), {}
+    begin = best = zoom.variables.start
+    many: dict[str, Any] = {}
+    if config.starts.count > 1:
+        many = run.once("starts", lambda: _searches.searched(zoom, config.starts))
+        best = jnp.asarray(many["vectors"][0])
+        middle = {"starts": zoom.merits(best).tolist()}
+    else:
+        moved = zoom_of(config, systems, ())
+        ends["moved"] = run.once("moved", lambda: searched(config, moved, run, "moved"))
+        middle = {"moved": ends["moved"]["merits"]}
+    ends["designed"] = run.once("designed", lambda: searched(config, zoom, run, "designed", best))
     end = zoom.fitted(ends["designed"]["vector"], margin=1e-3)
     lenses = {"start": [system.lens for system in systems], "designed": end}
     rows: list[dict[str, Any]] = [{"configuration": k} for k in count]
-    merits = {"start": zoom.merits(begin).tolist(), "moved": ends["moved"]["merits"]}
-    merits["end"] = ends["designed"]["merits"]
+    merits = {"start": zoom.merits(begin).tolist(), **middle, "end": ends["designed"]["merits"]}
     for name, values in merits.items():
         for row, value in zip(rows, values, strict=True):
             row[f"merit_{name}"] = value
@@ -158,7 +181,8 @@ def run(config: Config, run: Run) -> dict[str, Any]:
         row["distance_mm"] = far if math.isfinite(far) else None
     searches = {name: {k: v for k, v in end.items() if k != "vector"} for name, end in ends.items()}
     waves = {"wavelengths_um": first.wavelengths.tolist()}
-    return {"rows": rows, "searches": searches, **waves, **_common.settings(config, "lens")}
+    found = {"starts": {key: many[key] for key in _KEPT}} if many else {}
+    return {"rows": rows, "searches": searches, **found, **waves, "lens": config.lens}
 
 
 def tables(results: dict[str, Any]) -> dict[str, str]:
@@ -166,11 +190,13 @@ def tables(results: dict[str, Any]) -> dict[str, str]:
     first = {"configuration": "configuration", "focal_mm_designed": "focal length, mm"}
     if "magnification_designed" in results["rows"][0]:
         first |= {"magnification_designed": "magnification", "breathing_designed": "breathing"}
-    header = [*first.values(), "merit, mm^2, of the file", "gaps alone", "all"]
+    starts = results.get("starts")
+    between = f"best of {starts['count']} starts" if starts else "gaps alone"
+    header = [*first.values(), "merit, mm^2, of the file", between, "all"]
     header += ["RMS um, of the file", "all"]
     rows = []
     for row in results["rows"]:
-        merits = (row[f"merit_{name}"] for name in ("start", "moved", "end"))
+        merits = (row[f"merit_{k}"] for k in ("start", "starts" if starts else "moved", "end"))
         both = row["spots_um_start"], row["spots_um_designed"]
         spots = (", ".join(f"{um:.1f}" for um in some) for some in both)
         rows.append([*(row[key] + 0 for key in first), *merits, *spots])  # no -0
@@ -178,10 +204,28 @@ def tables(results: dict[str, Any]) -> dict[str, str]:
     searches = [[name, *map(end.get, keys)] for name, end in results["searches"].items()]
     titles = ["search", "ended", "Jacobians", "seconds", "compilation, s", "the nearest limit"]
     name = pathlib.Path(results["lens"]).stem
-    return {
+    found = {
         f"zoom, {name}": _common.table(header, rows),
         f"zoom, {name}: searches": _common.table(titles, searches),
     }
+    if starts:
+        sizes = _sizes(results)
+        good = [int(np.sum(sizes <= factor * sizes[0])) for factor in _GOOD]
+        rows = [["that pass light", starts["passed"]]]
+        rows += [[f"spots within {f:g} times the best", n] for f, n in zip(_GOOD, good)]
+        rows += [["trials of all", starts["trials"]], ["seconds", starts["seconds"]]]
+        rows += [["compilation, s", starts["compile_s"]]]
+        title = f"{starts['count']} starts", ""
+        found[f"zoom, {name}: starts"] = _common.table(title, rows)
+    return found
+
+
+def _sizes(results: dict[str, Any]) -> np.ndarray:
+    """RMS spots, um, of the starts that pass light, over all fields of all configurations, from
+    their scores, the smallest first."""
+    count = sum(len(row["fields_deg"]) for row in results["rows"])
+    scores = [score for score in results["starts"]["scores"] if score is not None]
+    return 1e3 * np.sqrt(np.sort(scores) / count)
 
 
 def draw(results: dict[str, Any], figures: pathlib.Path) -> None:
@@ -196,6 +240,12 @@ def draw(results: dict[str, Any], figures: pathlib.Path) -> None:
             spot = math.hypot(*row[f"spots_um_{name}"]) / math.sqrt(len(row["fields_deg"]))
             focal = row[f"focal_mm_{name}"]
             ax.set_title(f"{name}, f = {focal:.1f} mm, spots {spot:.1f} um", fontsize=9)
+    if results.get("starts"):
+        with _plots.picture(figures / "starts.png", 6, 3.4) as (ax,):
+            sizes = _sizes(results)
+            ax.semilogy(np.arange(1, len(sizes) + 1), sizes, "o", markersize=3)
+            _plots.label_axes(ax, "start, the best first", "RMS spot of all positions (um)")
+            ax.grid(alpha=0.3, which="both")
 
 
 if __name__ == "__main__":

@@ -86,6 +86,38 @@ def test_a_zoom_is_optimised_in_both_positions(tmp_path, monkeypatch, capsys):
 
 
 @pytest.mark.slow
+def test_a_zoom_is_searched_from_many_starts_for_given_focal_lengths(tmp_path, monkeypatch):
+    monkeypatch.chdir(ROOT)
+    (tmp_path / "toy.zmx").write_text(TOY)
+    few = [f"lens={tmp_path / 'toy.zmx'}", "order=2", "trials=60", "tolerance=0.1"]
+    few += ["moving=[{kind: thickness, surfaces: [1], low: 1, high: 40}, {kind: sensor}]"]
+    few += ["shared=[{kind: curvature}]", "operands=[{kind: spot}, {kind: air_edge, low: 0.1}]"]
+    few += ["keep=[{kind: effective_focal_length, values: [26, 30], per_cent: 1}]"]
+    few += ["starts={count: 4, spread: 2, stages: [5, 25], keep: 1}"]
+    _command.main(zoom, ["--out", str(tmp_path / "run"), "--set", *few])
+    results = json.loads((tmp_path / "run" / "results.json").read_text())
+    for row, wanted in zip(results["rows"], (26, 30)):
+        assert row["focal_mm_designed"] == pytest.approx(wanted, rel=0.0101)
+        assert row["merit_end"] <= 1.001 * row["merit_starts"]
+    scores = [score for score in results["starts"]["scores"] if score is not None]
+    assert len(scores) == results["starts"]["passed"] and results["starts"]["count"] == 4
+    total = sum(row["merit_end"] for row in results["rows"])
+    assert total <= 1.001 * min(scores)
+    assert (tmp_path / "run" / "figures" / "starts.png").is_file()
+    assert "| 4 starts" in zoom.tables(results)["zoom, toy: starts"]
+
+
+def test_as_many_values_as_configurations_are_asked_for(tmp_path, capsys):
+    (tmp_path / "toy.zmx").write_text(TOY)
+    few = [f"lens={tmp_path / 'toy.zmx'}", "keep=[{kind: effective_focal_length, values: [26]}]"]
+    with pytest.raises(SystemExit) as stopped:
+        _command.main(zoom, ["--out", str(tmp_path / "run"), "--set", *few])
+    assert stopped.value.code
+    told = capsys.readouterr().err.strip()
+    assert "keep: effective_focal_length: values: give one for each of 2, or none" in told
+
+
+@pytest.mark.slow
 def test_the_macro_lens_focuses_to_its_magnifications():
     """The file's object distances and gaps: paraxial foci, in which the pictures of the groups are
     infinity, 1:4 and 1:2."""
