@@ -19,7 +19,7 @@ from ..pupil.rules import PupilRule, Symmetry
 from ..rays import fermat
 from ..rays.find import Found
 from ..rays.solve import Solver, reattach
-from ..rays.status import Status, reaches_sensor
+from ..rays.status import Status
 from ..rays.system import Vector, dot, system_of
 from ..rays.trace import Bundle, aims, bundle_of, trace_bundle
 
@@ -92,12 +92,12 @@ class FieldRays:
     @property
     def arrives(self) -> Array:
         """Mask (V, W, Q) of the rays that meet the sensor, clipped or not."""
-        return reaches_sensor(self.bundle.status)
+        return self.bundle.arrives
 
     @property
     def sensor_hits(self) -> Array:
         """Hits on the sensor, (D, V, W, Q), mm, y last; 0 for failed rays."""
-        return jnp.stack([h[:, -1] for h in self.bundle.hits])
+        return jnp.stack(self.bundle.sensor)
 
     def views(self, fields: Sequence[int], distances: Sequence[int]) -> np.ndarray:
         """Numbers of the views of given fields and distances, which are counted from 0; () for
@@ -127,9 +127,7 @@ class FieldRays:
 
         shares, traced = self.wavelength_weights[waves], dict[str, Any]()
         if self.bundle is not None:
-            traced = {name: selected(getattr(self, name)) for name in _TRACED[1:]}
-            bundle = selected(self.bundle._replace(steps=self.throughput))
-            traced["bundle"] = bundle._replace(steps=self.bundle.steps[views])
+            traced = {name: selected(getattr(self, name)) for name in _TRACED}
         return dataclasses.replace(
             self,
             field=self.field[views],
@@ -167,8 +165,7 @@ def trace_views(lens: Lens, views: FieldRays, solver: Solver) -> FieldRays:
         scene = Scene(field, distance, views.wavelengths)
         points, weights = _points(rule, lens, scene)
         bundle = trace_bundle(lens, scene, points, solver)
-        failed = ~reaches_sensor(bundle.status)
-        light = weights * jnp.where(failed, 1, rule.transmission(lens, bundle))
+        light = weights * jnp.where(bundle.arrives, rule.transmission(lens, bundle), 1)
         throughput = jnp.sum(light, axis=-1)
         part = safe_divide(light, jnp.broadcast_to(throughput[:, None], light.shape))
         return bundle, points, weights, part, throughput
@@ -253,7 +250,7 @@ def _solid_angles(
     hits = jax.lax.stop_gradient(tuple(h[rows, one] for h in bundle.hits))
     arrival = fermat.arrival(hits, system_of(lens, scene, len(hits)))
     status = jnp.where(bundle.status == Status.CLIPPED, Status.OK, bundle.status)[one]
-    found = Found(hits, arrival, status.astype(jnp.int32), bundle.steps)
+    found = Found(hits, arrival, status.astype(jnp.int32), jnp.int32(0))
 
     def arriving(points: Vector, field: Array) -> tuple[Vector, Vector]:
         scene = Scene(field, distance, wavelength)

@@ -57,9 +57,7 @@ def _of_beams(lens: Lens, rays: FieldRays, function: Callable[[Beam], Any]) -> A
         scene = Scene(field, distance, rays.wavelengths)
         return function(beam_of(lens, scene, rule, points, light, bundle))
 
-    # `steps` is the only field without an axis of rays; it is not used here and is replaced.
-    of_rays = rays.points, light, rays.bundle._replace(steps=light)
-    of_rays = jax.tree.map(lambda a: a[..., EXTRAS:], of_rays)
+    of_rays = jax.tree.map(lambda a: a[..., EXTRAS:], (rays.points, light, rays.bundle))
     return jax.vmap(one)(rays.field, rays.distance, *of_rays)
 
 
