@@ -73,6 +73,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
+from ..image.chief import arrival_angle
 from ..image.spot import deviations, normalised
 from ..image.wavefront import path_differences
 from ..lens.glasses import glass_map_distance
@@ -257,9 +258,7 @@ def _lateral_colour(lens: Lens, rays: FieldRays) -> Array:
 
 def _chief_ray_angle(lens: Lens, rays: FieldRays) -> Array:
     """Angles of chief rays with the normal of the sensor, (V, W), radians."""
-    *across, along = (jnp.where(rays.arrives, a, 0)[..., 0] for a in rays.bundle.arrival)
-    sine = safe_sqrt(sum((a**2 for a in across), jnp.zeros_like(along)))
-    return jnp.arctan2(sine, jnp.where(sine + along**2 > 0, jnp.abs(along), 1))
+    return arrival_angle(lens, rays.bundle)[..., 0]
 
 
 def _numerical_aperture(lens: Lens, rays: FieldRays) -> Array:
@@ -268,12 +267,11 @@ def _numerical_aperture(lens: Lens, rays: FieldRays) -> Array:
     For unit vectors with the distance d, the sine of their angle satisfies sin^2 = d^2 (1 - d^2 /
     4).
     """
-    arrival = rays.bundle.arrival
-    lines = jnp.stack([jnp.where(rays.arrives, a, 0)[..., :EXTRAS] for a in arrival])
+    lines = jnp.stack(rays.bundle.arrival)[..., :EXTRAS]
     square = jnp.sum((lines[..., 1:] - lines[..., :1]) ** 2, axis=0)
     sines = square * (1 - square / 4)
     top, bottom, side = jnp.moveaxis(sines, -1, 0)
-    side = side if len(arrival) == 3 else top  # one radius stands for all azimuths
+    side = side if len(lines) == 3 else top  # one radius stands for all azimuths
     index = lens.index(rays.wavelengths)[-1]
     return index[None] * safe_sqrt((top + bottom + 2 * side) / 4)
 
