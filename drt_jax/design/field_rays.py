@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from ..image.spots import direction_determinant
+from ..image.spots import cones
 from ..lens.forms import FORMS
 from ..lens.lens import Lens
 from ..lens.scene import Scene
@@ -18,10 +18,11 @@ from ..pupil.clipped import Clipped
 from ..pupil.rules import PupilRule, Symmetry
 from ..rays import fermat
 from ..rays.find import Found
-from ..rays.solve import Solver, reattach
+from ..rays.known import Known
+from ..rays.solve import Solver
 from ..rays.status import Status
 from ..rays.system import Vector, dot, system_of
-from ..rays.trace import Bundle, aims, bundle_of, trace_bundle
+from ..rays.trace import Bundle, trace_bundle
 
 # The first rays of every view: the chief ray, and the rays through the top, bottom and side of the
 # rim of the stop. They have no weight.
@@ -222,44 +223,25 @@ def incidence_cosines(lens: Lens, rays: FieldRays) -> Array:
 def relative_illumination(lens: Lens, rays: FieldRays) -> Array:
     """Relative illumination (V,) at the middle wavelength, for a uniform Lambertian object.
 
-    It is the sum over rays that are not clipped of weight times projected solid angle at the sensor
-    (Slater), see `_solid_angles`, divided by that of the first field at the same distance.
+    It is the sum over rays that are not clipped of weight times projected solid angle at a point of
+    the sensor (Slater), see `image.spots.cones`, divided by that of the first field at the same
+    distance.
     """
-    middle = len(rays.wavelengths) // 2
-    one = slice(middle, middle + 1)
-    scene = rays.field, rays.distance, rays.bundle, rays.points
-    angles = jax.vmap(lambda *view: _solid_angles(lens, rays.wavelengths[one], one, *view))(*scene)
-    light = rays.weights[:, one] * rays.throughput[:, one, None]
-    light = jnp.where(rays.arrives[:, one], light, 0)
-    total = jnp.sum(light * jnp.abs(angles), axis=(1, 2)).reshape(rays.distances, rays.fields)
-    return jnp.ravel(safe_divide(total, jnp.broadcast_to(total[:, :1], total.shape)))
-
-
-def _solid_angles(
-    lens: Lens, wavelength: Array, one: slice, field: Array, distance: Array, bundle: Bundle,
-    points: Vector
-) -> Array:  # fmt: skip
-    """Determinant of dl/dp, (1, Q): area of direction cosines l at a fixed point of the sensor, for
-    each area of the stop.
-
-    The hit h and the direction l are functions of the stop point p and of the field f. The hit
-    stays fixed for df = -(dh/df)^-1 (dh/dp) dp, so that dl/dp = l_p - l_f h_f^-1 h_p.
-    """
+    one = rays.select((), (), (len(rays.wavelengths) // 2,))
     rows = np.array([*lens.active, lens.count])
-    scene = Scene(field, distance, wavelength)
-    hits = jax.lax.stop_gradient(tuple(h[rows, one] for h in bundle.hits))
-    arrival = fermat.arrival(hits, system_of(lens, scene, len(hits)))
-    status = jnp.where(bundle.status == Status.CLIPPED, Status.OK, bundle.status)[one]
-    found = Found(hits, arrival, status.astype(jnp.int32), jnp.int32(0))
 
-    def arriving(points: Vector, field: Array) -> tuple[Vector, Vector]:
-        scene = Scene(field, distance, wavelength)
-        system, target = aims(lens, scene, points)
-        bundle = bundle_of(lens, scene, system, target, reattach(found, system, target))
-        return tuple(h[-1] for h in bundle.hits), bundle.arrival[:-1]
+    def area(field: Array, distance: Array, bundle: Bundle, points: Vector) -> Array:
+        """|dl / dp|, (1, Q), of the rays of a view, which are not searched for again, except behind
+        an afocal lens, whose bundle does not know where they meet the sensor."""
+        scene = Scene(field, distance, one.wavelengths)
+        hits = jax.lax.stop_gradient(tuple(h[rows] for h in bundle.hits))
+        arrival = fermat.arrival(hits, system_of(lens, scene, len(hits)))
+        status = jnp.where(bundle.arrives, jnp.int32(Status.OK), bundle.status)
+        found = Found(hits, arrival, status, jnp.int32(0))
+        return cones(lens, scene, points, Known(None if lens.afocal else found), fixed=True)[1]
 
-    points = tuple(p[one] for p in points)
-    if len(points) == 1:  # on the axis, as the first field
-        return jnp.ones_like(points[0])
-    _, derivative = jax.linearize(arriving, points, field)
-    return direction_determinant(derivative, points, field, fixed=True)
+    light = jnp.where(one.arrives, one.weights * one.throughput[..., None], 0)
+    if len(one.points) == 2:  # else on the axis alone
+        light = light * jax.vmap(area)(one.field, one.distance, one.bundle, one.points)
+    total = jnp.sum(light, axis=(1, 2)).reshape(rays.distances, rays.fields)
+    return jnp.ravel(safe_divide(total, jnp.broadcast_to(total[:, :1], total.shape)))
