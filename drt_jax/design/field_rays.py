@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from ..image.spot import deviations, normalised
 from ..image.spots import cones
 from ..lens.forms import FORMS
 from ..lens.lens import Lens
@@ -140,6 +141,26 @@ class FieldRays:
             **traced,
         )
 
+    @property
+    def light(self) -> Array:
+        """Light (V, W, Q - 4) of the rays that have weight and meet the sensor. Its sum over the
+        rays of a wavelength is the weight of that wavelength, as in `psf_moments`.
+        """
+        arriving = jnp.where(self.arrives, self.weights, 0)[..., EXTRAS:]
+        return normalised(arriving) * self.wavelength_weights[None, :, None]
+
+    def spread(self, values: Vector, axes: tuple[int, ...] = (-2, -1)) -> tuple[Array, Vector]:
+        """Deviations of hits or slopes from their means, times the roots of `light`, and the means.
+
+        values: D arrays (V, W, Q).
+        axes: axes of the means: (-2, -1) for all wavelengths together, (-1,) for each.
+
+        Returns deviations (D, V, W, Q - 4), and means, D arrays with length 1 along `axes`.
+        """
+        light, own = self.light, tuple(a[..., EXTRAS:] for a in values)
+        parts, means = deviations(own, normalised(light, axes), self.symmetry, axes)
+        return jnp.stack(parts) * safe_sqrt(light)[None], means
+
     def unvignetted(self) -> "FieldRays":
         """The rays with the weights that they have if only the stop clips."""
         clipped = self.bundle.status == Status.CLIPPED
@@ -167,9 +188,7 @@ def trace_views(lens: Lens, views: FieldRays, solver: Solver) -> FieldRays:
         points, weights = _points(rule, lens, scene)
         bundle = trace_bundle(lens, scene, points, solver)
         light = weights * jnp.where(bundle.arrives, rule.transmission(lens, bundle), 1)
-        throughput = jnp.sum(light, axis=-1)
-        part = safe_divide(light, jnp.broadcast_to(throughput[:, None], light.shape))
-        return bundle, points, weights, part, throughput
+        return bundle, points, weights, normalised(light), jnp.sum(light, axis=-1)
 
     found = jax.vmap(one)(views.field, views.distance)
     traced: dict[str, Any] = dict(zip(_TRACED, found, strict=True))

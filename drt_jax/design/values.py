@@ -74,7 +74,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from ..image.chief import arrival_angle
-from ..image.spot import deviations, normalised
+from ..image.spot import normalised
 from ..image.wavefront import path_differences
 from ..lens.glasses import glass_map_distance
 from ..lens.lens import Lens
@@ -149,37 +149,21 @@ class OperandKind(NamedTuple):
         return self.function is relative_illumination
 
 
-def _hits(rays: FieldRays) -> tuple[Array, Array]:
-    """Hits on the sensor (D, V, W, Q), mm, and weights (V, W, Q).
-
-    Hits are 0 for rays without weight. Weights have the sum 1 over all wavelengths of a view.
-    """
-    light = jnp.where(rays.arrives, rays.weights, 0)[..., EXTRAS:]
-    # Normalise the light that arrives for each wavelength, as in `psf_moments`.
-    light = normalised(light) * rays.wavelength_weights[None, :, None]
-    return jnp.where(light[None] > 0, rays.sensor_hits[..., EXTRAS:], 0), light
-
-
-def _spot(lens: Lens, rays: FieldRays, axes: tuple[int, ...] = (-2, -1)) -> Array:
-    """Residuals of "spot", (D, V, W, Q), mm: distances of rays from the centroid over `axes`, times
-    the root of their weight.
-    """
-    hits, light = _hits(rays)
-    parts, _ = deviations(tuple(hits), normalised(light, axes), rays.symmetry, axes)
-    return jnp.stack(parts) * safe_sqrt(light)[None]
+def _spot(lens: Lens, rays: FieldRays) -> Array:
+    """Residuals of "spot", (D, V, W, Q), mm."""
+    return rays.spread(rays.bundle.sensor)[0]
 
 
 def _spot_of_colours(lens: Lens, rays: FieldRays) -> Array:
     """Residuals of "spot_of_colours", (D, V, W, Q), mm."""
-    return _spot(lens, rays, (-1,))
+    return rays.spread(rays.bundle.sensor, (-1,))[0]
 
 
 def _spot_chief(lens: Lens, rays: FieldRays) -> Array:
     """Residuals of "spot_chief", (D, V, W, Q), mm."""
-    hits, light = _hits(rays)
-    chief = rays.sensor_hits[..., 0]
-    middle = chief[..., chief.shape[-1] // 2, None, None]
-    return jnp.where(light[None] > 0, hits - middle, 0) * safe_sqrt(light)[None]
+    hits = rays.sensor_hits
+    chief = hits[..., hits.shape[-2] // 2, None, :1]
+    return (hits[..., EXTRAS:] - chief) * safe_sqrt(rays.light)[None]
 
 
 def _rms_spot(lens: Lens, rays: FieldRays) -> Array:
@@ -189,17 +173,15 @@ def _rms_spot(lens: Lens, rays: FieldRays) -> Array:
 
 def _centroid(lens: Lens, rays: FieldRays) -> Array:
     """y of the centroids (V,), mm."""
-    hits, light = _hits(rays)
-    return safe_divide(jnp.sum(light * hits[-1], (-2, -1)), jnp.sum(light, (-2, -1)))
+    return rays.spread(rays.bundle.sensor)[1][-1][:, 0, 0]
 
 
 def _path_difference(lens: Lens, rays: FieldRays) -> Array:
     """Residuals of "path_difference", (V, W, Q), waves."""
     of_view = lambda bundle: path_differences(lens, rays.wavelengths, bundle, None)[0]  # noqa: E731
     waves = jax.vmap(of_view)(rays.bundle)[..., EXTRAS:]
-    _, light = _hits(rays)
-    mean = jnp.sum(normalised(light) * waves, axis=-1, keepdims=True)
-    return (waves - mean) * safe_sqrt(light)
+    mean = jnp.sum(normalised(rays.light) * waves, axis=-1, keepdims=True)
+    return (waves - mean) * safe_sqrt(rays.light)
 
 
 def _rms_wavefront(lens: Lens, rays: FieldRays) -> Array:
