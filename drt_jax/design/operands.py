@@ -150,6 +150,8 @@ class Operand:
                     raise ValueError(f"{what}: {name}: no number {k}; there are {some}")
         if places is not None and not numbers["surfaces"]:
             raise ValueError(f"{what}: the lens has no surface with one; leave it out")
+        none = "an afocal lens has no image height; leave it out, see drt_jax.distortion"
+        require(not (self.kind == "distortion" and lens.afocal), f"{what}: {none}")
         if self.kind == "lateral_colour" and len(self.wavelengths or numbers["wavelengths"]) < 2:
             raise ValueError(f"{what}: wavelengths: needs two or more; leave it out")
 

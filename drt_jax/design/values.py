@@ -34,7 +34,8 @@ diffraction; the best value is 1, so use target=1; see waves.py
 
 chief rays, through the centre of the stop
     distortion [distance, field, wavelength: middle]: (real - paraxial image height) / paraxial
-        image height; 0 on the axis
+        image height; 0 on the axis. `drt_jax.distortion` compares with the chief rays near the
+        axis on the sensor, which differs by a factor where the sensor is out of focus
     lateral_colour [distance, field, all wavelengths except the first]: y on the sensor less that of
         the first wavelength, mm; and the same in x, if the pupil rule covers the whole disc
     chief_ray_angle [distance, field, wavelength]: angle with the normal at the sensor's vertex, at
@@ -73,13 +74,13 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from ..image.chief import arrival_angle
+from ..image.chief import arrival_angle, outwards
 from ..image.spot import normalised
 from ..image.wavefront import path_differences
 from ..lens.glasses import glass_map_distance
 from ..lens.lens import Lens
 from ..lens.paraxial import FirstOrder, first_order, image_height
-from ..numerics import matmul, safe_divide, safe_sqrt
+from ..numerics import matmul, safe_sqrt
 from .field_rays import (
     EXTRAS,
     FieldRays,
@@ -217,18 +218,14 @@ def _back_distance(lens: Lens, rays: FieldRays) -> Array:
 
 
 def _distortion(lens: Lens, rays: FieldRays) -> Array:
-    """(Real - paraxial image height) / paraxial image height, (V, W).
-
-    The real height is projected on the direction of the paraxial one: (h.p - p.p) / p.p.
-    """
+    """(Real - paraxial image height) / paraxial image height, (V, W), see `outwards`."""
 
     def ideal_of(field: Array, distance: Array) -> Array:
-        return image_height(lens, field, distance, rays.wavelengths)
+        return image_height(lens, field, distance, rays.wavelengths).T
 
-    real = rays.sensor_hits[..., 0]
-    ideal = jnp.moveaxis(jax.vmap(ideal_of)(rays.field, rays.distance), 1, 0)[-len(real) :]
-    size = jnp.sum(ideal**2, axis=0)
-    return safe_divide(jnp.sum(real * ideal, axis=0) - size, size)
+    real = jnp.stack(rays.bundle.sensor, axis=-1)[..., 0, :]
+    ideal = jax.vmap(ideal_of)(rays.field, rays.distance)
+    return outwards(real, ideal[..., -real.shape[-1] :])
 
 
 def _lateral_colour(lens: Lens, rays: FieldRays) -> Array:

@@ -150,7 +150,8 @@ def distortion(
         where it is, which is OpticStudio's reference; "fitted": calibrated, the least squares over
         the fields of the scene. A finite distance has the same formulae, with
         tan(field) = height / distance. For a lens without an axis a matrix takes the place of f,
-        the derivative of the hit at the field 0.
+        the derivative of the hit at the field 0. The operand "distortion" of a design compares with
+        the paraxial image height instead, which differs where the sensor is out of focus.
 
     ValueError for another mapping or focal length, and for points at several distances.
     """
@@ -189,18 +190,26 @@ def _distortion(
         place = place * jnp.where(size > 0, safe_divide(jnp.arctan(size), size), 1)
     ideal = einsum("wij,fj->fwi", scale, place)
     moved = jnp.where(whole[..., None], found.hit[1:] - found.hit[:1], 0)
-    along, square = jnp.sum(moved * ideal, axis=-1), jnp.sum(ideal**2, axis=-1)
-    square = jnp.where(whole, square, 0)
     if calibrated:
-        factor = safe_divide(jnp.sum(along, axis=0), jnp.sum(square, axis=0))
+        square = jnp.sum(jnp.where(whole[..., None], ideal**2, 0), axis=(0, 2))
+        factor = safe_divide(jnp.sum(moved * ideal, axis=(0, 2)), square)
         scale, ideal = scale * factor[:, None, None], ideal * factor[None, :, None]
-        along, square = along * factor[None], square * factor[None] ** 2
-    relative = jnp.where(whole, safe_divide(along - square, square), jnp.inf)
+    relative = jnp.where(whole, outwards(moved, ideal), jnp.inf)
     real, ideal = (
         jnp.where(whole[..., None], a, jnp.inf) for a in (found.hit[1:], ideal + found.hit[:1])
     )
     focal_length = jnp.where(found.whole[0], scale[:, 1, 1], jnp.inf)
     return Distortion(relative, real, ideal, focal_length)
+
+
+def outwards(real: Array, ideal: Array) -> Array:
+    """Displacements (...) of points from ideal ones, (..., D), along and relative to the distance
+    of the ideal point from the image of the axis; 0 on the axis, inf for one at infinity."""
+    near = jnp.isfinite(ideal)
+    ideal = jnp.where(near, ideal, 0)
+    square = jnp.sum(ideal**2, axis=-1)
+    moved = safe_divide(jnp.sum(real * ideal, axis=-1) - square, square)
+    return jnp.where(jnp.all(near, axis=-1), moved, jnp.inf)
 
 
 def _chief_rays(lens: Lens, scene: Scene) -> _ChiefRays:
