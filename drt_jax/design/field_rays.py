@@ -13,7 +13,7 @@ from ..image.spot import deviations, normalised
 from ..image.spots import cones
 from ..lens.forms import FORMS
 from ..lens.lens import Lens
-from ..lens.scene import Scene
+from ..lens.scene import Scene, over_points
 from ..numerics import safe_divide, safe_sqrt
 from ..pupil.clipped import Clipped
 from ..pupil.rules import PupilRule, Symmetry
@@ -57,10 +57,8 @@ class FieldRays:
     through the rim of the stop; these four have no weight. The fields from `bundle` on are None
     before rays are traced.
 
-    field: (V, 2), radians.
-    distance: (V,), mm.
-    wavelengths: (W,), um.
-    wavelength_weights: (W,), weights of the wavelengths, with the sum 1.
+    scene: fields (V, 2) and distances (V,) of the views, wavelengths, and their weights, with the
+        sum 1.
     rule: the pupil rule of all views.
     bundle: the rays, with a first axis (V,) in every array.
     points: D arrays (V, W, Q), stop points in units of the semi-diameter of the stop.
@@ -73,10 +71,7 @@ class FieldRays:
     fields, distances: numbers of fields and of distances.
     """
 
-    field: Array
-    distance: Array
-    wavelengths: Array
-    wavelength_weights: Array
+    scene: Scene
     rule: PupilRule
     fields: int = dataclasses.field(metadata={"static": True})
     distances: int = dataclasses.field(metadata={"static": True})
@@ -120,22 +115,20 @@ class FieldRays:
         """
         if not (fields or distances or wavelengths):
             return self
-        views = self.views(fields, distances)
-        waves = np.array(wavelengths or range(len(self.wavelengths)))
+        views, scene = self.views(fields, distances), self.scene
+        waves = np.array(wavelengths or range(len(scene.wavelengths)))
 
         def selected(tree: Any) -> Any:
             """Selects from arrays (V, W) and (V, ..., W, Q)."""
             return jax.tree.map(lambda a: a[views][..., *[waves, slice(None)][: a.ndim - 1]], tree)
 
-        shares, traced = self.wavelength_weights[waves], dict[str, Any]()
+        shares, traced = scene.spectrum[waves], dict[str, Any]()
+        colours = scene.wavelengths[waves], shares / jnp.sum(shares)
         if self.bundle is not None:
             traced = {name: selected(getattr(self, name)) for name in _TRACED}
         return dataclasses.replace(
             self,
-            field=self.field[views],
-            distance=self.distance[views],
-            wavelengths=self.wavelengths[waves],
-            wavelength_weights=shares / jnp.sum(shares),
+            scene=Scene(scene.field[views], scene.distance[views], *colours),
             fields=len(fields) or self.fields,
             distances=len(distances) or self.distances,
             **traced,
@@ -147,7 +140,7 @@ class FieldRays:
         rays of a wavelength is the weight of that wavelength, as in `psf_moments`.
         """
         arriving = jnp.where(self.arrives, self.weights, 0)[..., EXTRAS:]
-        return normalised(arriving) * self.wavelength_weights[None, :, None]
+        return normalised(arriving) * self.scene.spectrum[None, :, None]
 
     def spread(self, values: Vector, axes: tuple[int, ...] = (-2, -1)) -> tuple[Array, Vector]:
         """Deviations of hits or slopes from their means, times the roots of `light`, and the means.
@@ -183,14 +176,13 @@ def trace_views(lens: Lens, views: FieldRays, solver: Solver) -> FieldRays:
             "Gauss or Soft"
         )
 
-    def one(field: Array, distance: Array) -> tuple[Bundle, Vector, Array, Array, Array]:
-        scene = Scene(field, distance, views.wavelengths)
+    def one(scene: Scene) -> tuple[Bundle, Vector, Array, Array, Array]:
         points, weights = _points(rule, lens, scene)
         bundle = trace_bundle(lens, scene, points, solver)
         light = weights * jnp.where(bundle.arrives, rule.transmission(lens, bundle), 1)
         return bundle, points, weights, normalised(light), jnp.sum(light, axis=-1)
 
-    found = jax.vmap(one)(views.field, views.distance)
+    found = over_points(one, views.scene)
     traced: dict[str, Any] = dict(zip(_TRACED, found, strict=True))
     return dataclasses.replace(views, **traced)
 
@@ -228,15 +220,14 @@ def incidence_cosines(lens: Lens, rays: FieldRays) -> Array:
     """
     rows = np.array([*lens.active, lens.count])
 
-    def one(field: Array, distance: Array, hits: Vector, arrives: Array) -> Array:
-        scene = Scene(field, distance, rays.wavelengths)
-        system = system_of(lens, scene, len(hits))
-        path = fermat.geometry(tuple(h[rows] for h in hits), system)
+    def one(scene: Scene, bundle: Bundle) -> Array:
+        system = system_of(lens, scene, len(bundle.hits))
+        path = fermat.geometry(tuple(h[rows] for h in bundle.hits), system)
         normal = *(-s for s in path.slope), jnp.ones_like(path.slope[0])
         cosine = jnp.abs(dot(normal, path.before)) / jnp.sqrt(dot(normal, normal))
-        return jnp.where(arrives[None], cosine, 1)[:-1]
+        return jnp.where(bundle.arrives[None], cosine, 1)[:-1]
 
-    return jax.vmap(one)(rays.field, rays.distance, rays.bundle.hits, rays.arrives)
+    return over_points(one, rays.scene, rays.bundle)
 
 
 def relative_illumination(lens: Lens, rays: FieldRays) -> Array:
@@ -246,13 +237,12 @@ def relative_illumination(lens: Lens, rays: FieldRays) -> Array:
     the sensor (Slater), see `image.spots.cones`, divided by that of the first field at the same
     distance.
     """
-    one = rays.select((), (), (len(rays.wavelengths) // 2,))
+    one = rays.select((), (), (rays.scene.reference(None),))
     rows = np.array([*lens.active, lens.count])
 
-    def area(field: Array, distance: Array, bundle: Bundle, points: Vector) -> Array:
+    def area(scene: Scene, bundle: Bundle, points: Vector) -> Array:
         """|dl / dp|, (1, Q), of the rays of a view, which are not searched for again, except behind
         an afocal lens, whose bundle does not know where they meet the sensor."""
-        scene = Scene(field, distance, one.wavelengths)
         hits = jax.lax.stop_gradient(tuple(h[rows] for h in bundle.hits))
         arrival = fermat.arrival(hits, system_of(lens, scene, len(hits)))
         status = jnp.where(bundle.arrives, jnp.int32(Status.OK), bundle.status)
@@ -261,6 +251,6 @@ def relative_illumination(lens: Lens, rays: FieldRays) -> Array:
 
     light = jnp.where(one.arrives, one.weights * one.throughput[..., None], 0)
     if len(one.points) == 2:  # else on the axis alone
-        light = light * jax.vmap(area)(one.field, one.distance, one.bundle, one.points)
+        light = light * over_points(area, one.scene, one.bundle, one.points)
     total = jnp.sum(light, axis=(1, 2)).reshape(rays.distances, rays.fields)
     return jnp.ravel(safe_divide(total, jnp.broadcast_to(total[:, :1], total.shape)))

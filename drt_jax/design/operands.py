@@ -187,7 +187,7 @@ class Operand:
             return kind.function(lens, rays)[rays.views(self.fields, self.distances)]
         waves = self.wavelengths
         if "middle" in kind.axes and not waves:
-            waves = (len(rays.wavelengths) // 2,)
+            waves = (rays.scene.reference(None),)
         arguments = () if self.at is None else (self.at,)
         values = kind.function(lens, rays.select(self.fields, self.distances, waves), *arguments)
         places = kind.rows or kind.places

@@ -80,6 +80,7 @@ from ..image.wavefront import path_differences
 from ..lens.glasses import glass_map_distance
 from ..lens.lens import Lens
 from ..lens.paraxial import FirstOrder, first_order, image_height
+from ..lens.scene import Scene, over_points
 from ..numerics import matmul, safe_sqrt
 from .field_rays import (
     EXTRAS,
@@ -179,7 +180,7 @@ def _centroid(lens: Lens, rays: FieldRays) -> Array:
 
 def _path_difference(lens: Lens, rays: FieldRays) -> Array:
     """Residuals of "path_difference", (V, W, Q), waves."""
-    of_view = lambda bundle: path_differences(lens, rays.wavelengths, bundle, None)[0]  # noqa: E731
+    of_view = lambda bundle: path_differences(lens, rays.scene.wavelengths, bundle, None)[0]  # noqa: E731
     waves = jax.vmap(of_view)(rays.bundle)[..., EXTRAS:]
     mean = jnp.sum(normalised(rays.light) * waves, axis=-1, keepdims=True)
     return (waves - mean) * safe_sqrt(rays.light)
@@ -192,7 +193,7 @@ def _rms_wavefront(lens: Lens, rays: FieldRays) -> Array:
 
 def _throughput(lens: Lens, rays: FieldRays) -> Array:
     """Unvignetted fraction of the light (V,)."""
-    return matmul(rays.throughput, rays.wavelength_weights)
+    return matmul(rays.throughput, rays.scene.spectrum)
 
 
 def _first_order(get: Callable[[FirstOrder], Array]) -> Function:
@@ -201,7 +202,7 @@ def _first_order(get: Callable[[FirstOrder], Array]) -> Function:
     """
 
     def values(lens: Lens, rays: FieldRays) -> Array:
-        far, waves = rays.distance[:: rays.fields], rays.wavelengths
+        far, waves = rays.scene.distance[:: rays.fields], rays.scene.wavelengths
         return jax.vmap(lambda distance: get(first_order(lens, distance, waves)))(far)
 
     return values
@@ -209,7 +210,7 @@ def _first_order(get: Callable[[FirstOrder], Array]) -> Function:
 
 def _lens_alone(get: Callable[[FirstOrder], Array]) -> Function:
     """A function that returns a first-order value that depends on wavelength alone, (W,)."""
-    return lambda lens, rays: get(first_order(lens, jnp.inf, rays.wavelengths))
+    return lambda lens, rays: get(first_order(lens, jnp.inf, rays.scene.wavelengths))
 
 
 def _back_distance(lens: Lens, rays: FieldRays) -> Array:
@@ -220,11 +221,11 @@ def _back_distance(lens: Lens, rays: FieldRays) -> Array:
 def _distortion(lens: Lens, rays: FieldRays) -> Array:
     """(Real - paraxial image height) / paraxial image height, (V, W), see `outwards`."""
 
-    def ideal_of(field: Array, distance: Array) -> Array:
-        return image_height(lens, field, distance, rays.wavelengths).T
+    def ideal_of(scene: Scene) -> Array:
+        return image_height(lens, scene.field, scene.distance, scene.wavelengths).T
 
     real = jnp.stack(rays.bundle.sensor, axis=-1)[..., 0, :]
-    ideal = jax.vmap(ideal_of)(rays.field, rays.distance)
+    ideal = over_points(ideal_of, rays.scene)
     return outwards(real, ideal[..., -real.shape[-1] :])
 
 
@@ -251,7 +252,7 @@ def _numerical_aperture(lens: Lens, rays: FieldRays) -> Array:
     sines = square * (1 - square / 4)
     top, bottom, side = jnp.moveaxis(sines, -1, 0)
     side = side if len(lines) == 3 else top  # one radius stands for all azimuths
-    index = lens.index(rays.wavelengths)[-1]
+    index = lens.index(rays.scene.wavelengths)[-1]
     return index[None] * safe_sqrt((top + bottom + 2 * side) / 4)
 
 
