@@ -51,7 +51,7 @@ ROOMS = {
     "drt_jax/check": 329,
     "drt_jax/design": 3291,
     "drt_jax/files": 3120,
-    "drt_jax/image": 2983,
+    "drt_jax/image": 2982,
     "drt_jax/learn": 655,
     "drt_jax/lens": 1881,
     "drt_jax/pupil": 774,

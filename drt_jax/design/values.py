@@ -75,7 +75,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from ..image.chief import arrival_angle, outwards
-from ..image.spot import normalised
+from ..image.spot import deviations, normalised
 from ..image.wavefront import path_differences
 from ..lens.glasses import glass_map_distance
 from ..lens.lens import Lens
@@ -182,8 +182,8 @@ def _path_difference(lens: Lens, rays: FieldRays) -> Array:
     """Residuals of "path_difference", (V, W, Q), waves."""
     of_view = lambda bundle: path_differences(lens, rays.scene.wavelengths, bundle, None)[0]  # noqa: E731
     waves = jax.vmap(of_view)(rays.bundle)[..., EXTRAS:]
-    mean = jnp.sum(normalised(rays.light) * waves, axis=-1, keepdims=True)
-    return (waves - mean) * safe_sqrt(rays.light)
+    (apart,), _ = deviations((waves,), normalised(rays.light), "none")
+    return apart * safe_sqrt(rays.light)
 
 
 def _rms_wavefront(lens: Lens, rays: FieldRays) -> Array:

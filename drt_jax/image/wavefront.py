@@ -30,6 +30,7 @@ from ..rays.status import Status
 from ..rays.system import dot
 from ..rays.trace import FOCAL, Bundle, trace_bundle
 from .rounding import warn_of_paths
+from .spot import deviations, normalised
 
 _MM = 1e-3  # per um
 
@@ -167,7 +168,6 @@ def rms_wavefront(wave: Wavefront, weights: Numbers) -> Array:
     weight = real_array("weights", weights, wave.opd.dtype)
     if weight.shape != wave.opd.shape[-1:]:
         raise ValueError(f"weights: expected {wave.opd.shape[-1:]}, got shape {weight.shape}")
-    weight = jnp.where(wave.status == Status.OK, weight, 0)
-    weight = safe_divide(weight, jnp.sum(weight, axis=-1, keepdims=True))
-    mean = jnp.sum(weight * wave.opd, axis=-1, keepdims=True)
-    return safe_sqrt(jnp.sum(weight * (wave.opd - mean) ** 2, axis=-1))
+    weight = normalised(jnp.where(wave.status == Status.OK, weight, 0))
+    (apart,), _ = deviations((wave.opd,), weight, "none")
+    return safe_sqrt(jnp.sum(weight * apart**2, axis=-1))
