@@ -61,9 +61,8 @@ def values(problem, lens):
         for name, kind in KINDS.items()
     }
     light = jnp.where(rays.arrives, rays.weights, 0)[None]
-    slope = jnp.where(rays.arrives, jnp.stack(rays.bundle.arrival[:-1]), 0)
-    slope = slope / jnp.where(rays.arrives, rays.bundle.arrival[-1], 1)
-    hits, slope = (a - jnp.sum(light * a, -1, keepdims=True) for a in (rays.sensor_hits, slope))
+    both = map(jnp.stack, (rays.bundle.sensor, rays.bundle.slopes))
+    hits, slope = (a - jnp.sum(light * a, -1, keepdims=True) for a in both)
     focus = -jnp.sum(light * hits * slope, (0, -1)) / jnp.sum(light * slope**2, (0, -1))
     kernels = {kind: design.psf(lens, rays, airy, 15, kind).kernel for kind in ("rays", "waves")}
     return found | {"focus": focus * aperture**2 / WAVELENGTH} | kernels

@@ -12,11 +12,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from ..image.spot import deviations, normalised
 from ..inputs import require, require_one_of
 from ..lens.lens import Lens
-from ..numerics import concrete, matmul, safe_divide, safe_sqrt
-from ..rays.status import Status
+from ..numerics import concrete, matmul
 from .field_rays import EXTRAS, FieldRays, symmetry_by_structure
 from .problem import Problem
 
@@ -50,43 +48,20 @@ class AsBuilt(NamedTuple):
         return jnp.sqrt(jnp.mean(self.squares, axis=-1))
 
 
-def _spots(rays: FieldRays) -> tuple[Array, Array, Array]:
-    """Distances of rays from the centroid of their view, and the derivatives of these distances.
-
-    Returns distances, mm, and their derivatives by the shift of the sensor, (D, V, W Q) each, times
-    the root of the weight of the ray; and the centroids (2, V), mm.
-    """
-    waves = rays.wavelength_weights[None, :, None]
-    light = (rays.weights * waves)[..., EXTRAS:]
-    passes = (rays.bundle.status == Status.OK)[..., EXTRAS:] & (light > 0)
-    light = jnp.where(passes, light, 0)
-    arrival = [a[..., EXTRAS:] for a in rays.bundle.arrival]
-    hits = [h[:, -1, :, EXTRAS:] for h in rays.bundle.hits]
-    slopes = [safe_divide(a, arrival[-1]) for a in arrival[:-1]]
-    weight = normalised(light, (-2, -1))
-    root = safe_sqrt(weight)
-
-    def scaled(values: list[Array]) -> tuple[Array, tuple[Array, ...]]:
-        known = tuple(jnp.where(passes, value, 0) for value in values)
-        parts, means = deviations(known, weight, rays.symmetry, (-2, -1))
-        return jnp.stack([root * part for part in parts]).reshape(len(hits), len(light), -1), means
-
-    (offsets, means), (growth, _) = scaled(hits), scaled(slopes)
-    centre = jnp.stack(means)[..., 0, 0]
-    return offsets, growth, jnp.concatenate([jnp.zeros_like(centre[: 2 - len(hits)]), centre])
-
-
 def _with_levers(
     lens: Lens, rays: FieldRays, compensator: Compensator
 ) -> tuple[Array, Array, Array]:
-    """Distances (D, V, W Q) from the centroids and their derivatives g, see `_spots`, and how far
-    the sensor moves at each spot for each adjustment, the levers (L, V).
+    """Distances (D, V, W Q) of rays from the centroid of their view, mm, and their derivatives g by
+    the shift of the sensor, both times the root of the weight of the ray; and how far the sensor
+    moves at each spot for each adjustment, the levers (L, V).
 
     At a spot (x, y) the sensor moves by d n + a y + b x along its normal, where d is the change of
     `Lens.sensor`, n the normal component of the motion of the sensor, and a, b are the tilts.
     """
-    offsets, growth, (x, y) = _spots(rays)
-    motion = lens.sensor_motion
+    each = map(rays.spread, (rays.bundle.sensor, rays.bundle.slopes))
+    (offsets, means), (growth, _) = ((a.reshape(*a.shape[:2], -1), mean) for a, mean in each)
+    y, motion = means[-1][:, 0, 0], lens.sensor_motion
+    x = means[0][:, 0, 0] if len(means) == 2 else jnp.zeros_like(y)
     normal = jnp.ones_like(x) if motion is None else jnp.broadcast_to(motion[2], x.shape)
     return offsets, growth, jnp.stack([normal, y, x])[: COUNTS[compensator]]
 

@@ -6,7 +6,7 @@ import numpy as np
 from jax import Array
 
 from ..lens.lens import Lens
-from ..lens.scene import Scene
+from ..lens.scene import Scene, over_points
 from ..numerics import safe_divide, safe_sqrt
 from ..rays.aim import beam_size, paraxial_launch
 from ..rays.meet import quadratic
@@ -23,22 +23,22 @@ def failures(lens: Lens, rays: FieldRays) -> Array:
     A chief ray has the weight of all light of its wavelength. If all light of a wavelength is
     clipped, its residuals are inf.
     """
-    light = rays.weights * rays.wavelength_weights[None, :, None]
+    share = rays.scene.spectrum[None, :, None]
+    light = rays.weights * share
     chief = np.arange(light.shape[-1]) == 0
-    light = jnp.where(chief[None, None], rays.wavelength_weights[None, :, None], light)
+    light = jnp.where(chief[None, None], share, light)
     failed = ~rays.arrives & (light > 0)
     root = jnp.sqrt(jnp.where(failed, light, 1))
     dark = rays.throughput[..., None] == 0
 
-    def of_view(field: Array, distance: Array, points: Vector) -> Array:
+    def of_view(scene: Scene, points: Vector) -> Array:
         """Shortfall (W, Q) of the paraxial launch of each ray."""
-        scene = Scene(field, distance, rays.wavelengths)
         system, target = aims(lens, scene, points)
         launch = paraxial_launch(system, target, beam_size(system, target)[1])
         return shortfall(system, launch, target)
 
     def of_all(_: None) -> Array:
-        return jax.vmap(of_view)(rays.field, rays.distance, rays.points)
+        return over_points(of_view, rays.scene, rays.points)
 
     none = jnp.zeros_like(rays.weights)
     found = jax.lax.cond(jnp.any(~rays.arrives), of_all, lambda _: none, None)

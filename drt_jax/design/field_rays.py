@@ -9,19 +9,21 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from ..image.spots import direction_determinant
+from ..image.spot import deviations, normalised
+from ..image.spots import cones
 from ..lens.forms import FORMS
 from ..lens.lens import Lens
-from ..lens.scene import Scene
+from ..lens.scene import Scene, over_points
 from ..numerics import safe_divide, safe_sqrt
 from ..pupil.clipped import Clipped
 from ..pupil.rules import PupilRule, Symmetry
 from ..rays import fermat
 from ..rays.find import Found
-from ..rays.solve import Solver, reattach
-from ..rays.status import Status, reaches_sensor
+from ..rays.known import Known
+from ..rays.solve import Solver
+from ..rays.status import Status
 from ..rays.system import Vector, dot, system_of
-from ..rays.trace import Bundle, aims, bundle_of, trace_bundle
+from ..rays.trace import Bundle, trace_bundle
 
 # The first rays of every view: the chief ray, and the rays through the top, bottom and side of the
 # rim of the stop. They have no weight.
@@ -55,10 +57,8 @@ class FieldRays:
     through the rim of the stop; these four have no weight. The fields from `bundle` on are None
     before rays are traced.
 
-    field: (V, 2), radians.
-    distance: (V,), mm.
-    wavelengths: (W,), um.
-    wavelength_weights: (W,), weights of the wavelengths, with the sum 1.
+    scene: fields (V, 2) and distances (V,) of the views, wavelengths, and their weights, with the
+        sum 1.
     rule: the pupil rule of all views.
     bundle: the rays, with a first axis (V,) in every array.
     points: D arrays (V, W, Q), stop points in units of the semi-diameter of the stop.
@@ -71,10 +71,7 @@ class FieldRays:
     fields, distances: numbers of fields and of distances.
     """
 
-    field: Array
-    distance: Array
-    wavelengths: Array
-    wavelength_weights: Array
+    scene: Scene
     rule: PupilRule
     fields: int = dataclasses.field(metadata={"static": True})
     distances: int = dataclasses.field(metadata={"static": True})
@@ -92,12 +89,12 @@ class FieldRays:
     @property
     def arrives(self) -> Array:
         """Mask (V, W, Q) of the rays that meet the sensor, clipped or not."""
-        return reaches_sensor(self.bundle.status)
+        return self.bundle.arrives
 
     @property
     def sensor_hits(self) -> Array:
         """Hits on the sensor, (D, V, W, Q), mm, y last; 0 for failed rays."""
-        return jnp.stack([h[:, -1] for h in self.bundle.hits])
+        return jnp.stack(self.bundle.sensor)
 
     def views(self, fields: Sequence[int], distances: Sequence[int]) -> np.ndarray:
         """Numbers of the views of given fields and distances, which are counted from 0; () for
@@ -118,28 +115,44 @@ class FieldRays:
         """
         if not (fields or distances or wavelengths):
             return self
-        views = self.views(fields, distances)
-        waves = np.array(wavelengths or range(len(self.wavelengths)))
+        views, scene = self.views(fields, distances), self.scene
+        waves = np.array(wavelengths or range(len(scene.wavelengths)))
 
         def selected(tree: Any) -> Any:
             """Selects from arrays (V, W) and (V, ..., W, Q)."""
             return jax.tree.map(lambda a: a[views][..., *[waves, slice(None)][: a.ndim - 1]], tree)
 
-        shares, traced = self.wavelength_weights[waves], dict[str, Any]()
+        shares, traced = scene.spectrum[waves], dict[str, Any]()
+        colours = scene.wavelengths[waves], shares / jnp.sum(shares)
         if self.bundle is not None:
-            traced = {name: selected(getattr(self, name)) for name in _TRACED[1:]}
-            bundle = selected(self.bundle._replace(steps=self.throughput))
-            traced["bundle"] = bundle._replace(steps=self.bundle.steps[views])
+            traced = {name: selected(getattr(self, name)) for name in _TRACED}
         return dataclasses.replace(
             self,
-            field=self.field[views],
-            distance=self.distance[views],
-            wavelengths=self.wavelengths[waves],
-            wavelength_weights=shares / jnp.sum(shares),
+            scene=Scene(scene.field[views], scene.distance[views], *colours),
             fields=len(fields) or self.fields,
             distances=len(distances) or self.distances,
             **traced,
         )
+
+    @property
+    def light(self) -> Array:
+        """Light (V, W, Q - 4) of the rays that have weight and meet the sensor. Its sum over the
+        rays of a wavelength is the weight of that wavelength, as in `psf_moments`.
+        """
+        arriving = jnp.where(self.arrives, self.weights, 0)[..., EXTRAS:]
+        return normalised(arriving) * self.scene.spectrum[None, :, None]
+
+    def spread(self, values: Vector, axes: tuple[int, ...] = (-2, -1)) -> tuple[Array, Vector]:
+        """Deviations of hits or slopes from their means, times the roots of `light`, and the means.
+
+        values: D arrays (V, W, Q).
+        axes: axes of the means: (-2, -1) for all wavelengths together, (-1,) for each.
+
+        Returns deviations (D, V, W, Q - 4), and means, D arrays with length 1 along `axes`.
+        """
+        light, own = self.light, tuple(a[..., EXTRAS:] for a in values)
+        parts, means = deviations(own, normalised(light, axes), self.symmetry, axes)
+        return jnp.stack(parts) * safe_sqrt(light)[None], means
 
     def unvignetted(self) -> "FieldRays":
         """The rays with the weights that they have if only the stop clips."""
@@ -163,17 +176,13 @@ def trace_views(lens: Lens, views: FieldRays, solver: Solver) -> FieldRays:
             "Gauss or Soft"
         )
 
-    def one(field: Array, distance: Array) -> tuple[Bundle, Vector, Array, Array, Array]:
-        scene = Scene(field, distance, views.wavelengths)
+    def one(scene: Scene) -> tuple[Bundle, Vector, Array, Array, Array]:
         points, weights = _points(rule, lens, scene)
         bundle = trace_bundle(lens, scene, points, solver)
-        failed = ~reaches_sensor(bundle.status)
-        light = weights * jnp.where(failed, 1, rule.transmission(lens, bundle))
-        throughput = jnp.sum(light, axis=-1)
-        part = safe_divide(light, jnp.broadcast_to(throughput[:, None], light.shape))
-        return bundle, points, weights, part, throughput
+        light = weights * jnp.where(bundle.arrives, rule.transmission(lens, bundle), 1)
+        return bundle, points, weights, normalised(light), jnp.sum(light, axis=-1)
 
-    found = jax.vmap(one)(views.field, views.distance)
+    found = over_points(one, views.scene)
     traced: dict[str, Any] = dict(zip(_TRACED, found, strict=True))
     return dataclasses.replace(views, **traced)
 
@@ -211,58 +220,37 @@ def incidence_cosines(lens: Lens, rays: FieldRays) -> Array:
     """
     rows = np.array([*lens.active, lens.count])
 
-    def one(field: Array, distance: Array, hits: Vector, arrives: Array) -> Array:
-        scene = Scene(field, distance, rays.wavelengths)
-        system = system_of(lens, scene, len(hits))
-        path = fermat.geometry(tuple(h[rows] for h in hits), system)
+    def one(scene: Scene, bundle: Bundle) -> Array:
+        system = system_of(lens, scene, len(bundle.hits))
+        path = fermat.geometry(tuple(h[rows] for h in bundle.hits), system)
         normal = *(-s for s in path.slope), jnp.ones_like(path.slope[0])
         cosine = jnp.abs(dot(normal, path.before)) / jnp.sqrt(dot(normal, normal))
-        return jnp.where(arrives[None], cosine, 1)[:-1]
+        return jnp.where(bundle.arrives[None], cosine, 1)[:-1]
 
-    return jax.vmap(one)(rays.field, rays.distance, rays.bundle.hits, rays.arrives)
+    return over_points(one, rays.scene, rays.bundle)
 
 
 def relative_illumination(lens: Lens, rays: FieldRays) -> Array:
     """Relative illumination (V,) at the middle wavelength, for a uniform Lambertian object.
 
-    It is the sum over rays that are not clipped of weight times projected solid angle at the sensor
-    (Slater), see `_solid_angles`, divided by that of the first field at the same distance.
+    It is the sum over rays that are not clipped of weight times projected solid angle at a point of
+    the sensor (Slater), see `image.spots.cones`, divided by that of the first field at the same
+    distance.
     """
-    middle = len(rays.wavelengths) // 2
-    one = slice(middle, middle + 1)
-    scene = rays.field, rays.distance, rays.bundle, rays.points
-    angles = jax.vmap(lambda *view: _solid_angles(lens, rays.wavelengths[one], one, *view))(*scene)
-    light = rays.weights[:, one] * rays.throughput[:, one, None]
-    light = jnp.where(rays.arrives[:, one], light, 0)
-    total = jnp.sum(light * jnp.abs(angles), axis=(1, 2)).reshape(rays.distances, rays.fields)
-    return jnp.ravel(safe_divide(total, jnp.broadcast_to(total[:, :1], total.shape)))
-
-
-def _solid_angles(
-    lens: Lens, wavelength: Array, one: slice, field: Array, distance: Array, bundle: Bundle,
-    points: Vector
-) -> Array:  # fmt: skip
-    """Determinant of dl/dp, (1, Q): area of direction cosines l at a fixed point of the sensor, for
-    each area of the stop.
-
-    The hit h and the direction l are functions of the stop point p and of the field f. The hit
-    stays fixed for df = -(dh/df)^-1 (dh/dp) dp, so that dl/dp = l_p - l_f h_f^-1 h_p.
-    """
+    one = rays.select((), (), (rays.scene.reference(None),))
     rows = np.array([*lens.active, lens.count])
-    scene = Scene(field, distance, wavelength)
-    hits = jax.lax.stop_gradient(tuple(h[rows, one] for h in bundle.hits))
-    arrival = fermat.arrival(hits, system_of(lens, scene, len(hits)))
-    status = jnp.where(bundle.status == Status.CLIPPED, Status.OK, bundle.status)[one]
-    found = Found(hits, arrival, status.astype(jnp.int32), bundle.steps)
 
-    def arriving(points: Vector, field: Array) -> tuple[Vector, Vector]:
-        scene = Scene(field, distance, wavelength)
-        system, target = aims(lens, scene, points)
-        bundle = bundle_of(lens, scene, system, target, reattach(found, system, target))
-        return tuple(h[-1] for h in bundle.hits), bundle.arrival[:-1]
+    def area(scene: Scene, bundle: Bundle, points: Vector) -> Array:
+        """|dl / dp|, (1, Q), of the rays of a view, which are not searched for again, except behind
+        an afocal lens, whose bundle does not know where they meet the sensor."""
+        hits = jax.lax.stop_gradient(tuple(h[rows] for h in bundle.hits))
+        arrival = fermat.arrival(hits, system_of(lens, scene, len(hits)))
+        status = jnp.where(bundle.arrives, jnp.int32(Status.OK), bundle.status)
+        found = Found(hits, arrival, status, jnp.int32(0))
+        return cones(lens, scene, points, Known(None if lens.afocal else found), fixed=True)[1]
 
-    points = tuple(p[one] for p in points)
-    if len(points) == 1:  # on the axis, as the first field
-        return jnp.ones_like(points[0])
-    _, derivative = jax.linearize(arriving, points, field)
-    return direction_determinant(derivative, points, field, fixed=True)
+    light = jnp.where(one.arrives, one.weights * one.throughput[..., None], 0)
+    if len(one.points) == 2:  # else on the axis alone
+        light = light * over_points(area, one.scene, one.bundle, one.points)
+    total = jnp.sum(light, axis=(1, 2)).reshape(rays.distances, rays.fields)
+    return jnp.ravel(safe_divide(total, jnp.broadcast_to(total[:, :1], total.shape)))

@@ -150,6 +150,8 @@ class Operand:
                     raise ValueError(f"{what}: {name}: no number {k}; there are {some}")
         if places is not None and not numbers["surfaces"]:
             raise ValueError(f"{what}: the lens has no surface with one; leave it out")
+        none = "an afocal lens has no image height; leave it out, see drt_jax.distortion"
+        require(not (self.kind == "distortion" and lens.afocal), f"{what}: {none}")
         if self.kind == "lateral_colour" and len(self.wavelengths or numbers["wavelengths"]) < 2:
             raise ValueError(f"{what}: wavelengths: needs two or more; leave it out")
 
@@ -185,7 +187,7 @@ class Operand:
             return kind.function(lens, rays)[rays.views(self.fields, self.distances)]
         waves = self.wavelengths
         if "middle" in kind.axes and not waves:
-            waves = (len(rays.wavelengths) // 2,)
+            waves = (rays.scene.reference(None),)
         arguments = () if self.at is None else (self.at,)
         values = kind.function(lens, rays.select(self.fields, self.distances, waves), *arguments)
         places = kind.rows or kind.places

@@ -199,8 +199,8 @@ class Problem:
         """All fields at all distances, without rays."""
         fields, distances = len(self.fields), len(self.distances)
         field, distance = jnp.tile(self.fields, (distances, 1)), jnp.repeat(self.distances, fields)
-        waves = self.wavelengths, self.wavelength_weights
-        return FieldRays(field, distance, *waves, self.rule, fields, distances)
+        scene = Scene(field, distance, self.wavelengths, self.wavelength_weights)
+        return FieldRays(scene, self.rule, fields, distances)
 
     @property
     def traces(self) -> bool:

@@ -34,7 +34,8 @@ diffraction; the best value is 1, so use target=1; see waves.py
 
 chief rays, through the centre of the stop
     distortion [distance, field, wavelength: middle]: (real - paraxial image height) / paraxial
-        image height; 0 on the axis
+        image height; 0 on the axis. `drt_jax.distortion` compares with the chief rays near the
+        axis on the sensor, which differs by a factor where the sensor is out of focus
     lateral_colour [distance, field, all wavelengths except the first]: y on the sensor less that of
         the first wavelength, mm; and the same in x, if the pupil rule covers the whole disc
     chief_ray_angle [distance, field, wavelength]: angle with the normal at the sensor's vertex, at
@@ -73,12 +74,14 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
+from ..image.chief import arrival_angle, outwards
 from ..image.spot import deviations, normalised
 from ..image.wavefront import path_differences
 from ..lens.glasses import glass_map_distance
 from ..lens.lens import Lens
 from ..lens.paraxial import FirstOrder, first_order, image_height
-from ..numerics import matmul, safe_divide, safe_sqrt
+from ..lens.scene import Scene, over_points
+from ..numerics import matmul, safe_sqrt
 from .field_rays import (
     EXTRAS,
     FieldRays,
@@ -148,37 +151,21 @@ class OperandKind(NamedTuple):
         return self.function is relative_illumination
 
 
-def _hits(rays: FieldRays) -> tuple[Array, Array]:
-    """Hits on the sensor (D, V, W, Q), mm, and weights (V, W, Q).
-
-    Hits are 0 for rays without weight. Weights have the sum 1 over all wavelengths of a view.
-    """
-    light = jnp.where(rays.arrives, rays.weights, 0)[..., EXTRAS:]
-    # Normalise the light that arrives for each wavelength, as in `psf_moments`.
-    light = normalised(light) * rays.wavelength_weights[None, :, None]
-    return jnp.where(light[None] > 0, rays.sensor_hits[..., EXTRAS:], 0), light
-
-
-def _spot(lens: Lens, rays: FieldRays, axes: tuple[int, ...] = (-2, -1)) -> Array:
-    """Residuals of "spot", (D, V, W, Q), mm: distances of rays from the centroid over `axes`, times
-    the root of their weight.
-    """
-    hits, light = _hits(rays)
-    parts, _ = deviations(tuple(hits), normalised(light, axes), rays.symmetry, axes)
-    return jnp.stack(parts) * safe_sqrt(light)[None]
+def _spot(lens: Lens, rays: FieldRays) -> Array:
+    """Residuals of "spot", (D, V, W, Q), mm."""
+    return rays.spread(rays.bundle.sensor)[0]
 
 
 def _spot_of_colours(lens: Lens, rays: FieldRays) -> Array:
     """Residuals of "spot_of_colours", (D, V, W, Q), mm."""
-    return _spot(lens, rays, (-1,))
+    return rays.spread(rays.bundle.sensor, (-1,))[0]
 
 
 def _spot_chief(lens: Lens, rays: FieldRays) -> Array:
     """Residuals of "spot_chief", (D, V, W, Q), mm."""
-    hits, light = _hits(rays)
-    chief = rays.sensor_hits[..., 0]
-    middle = chief[..., chief.shape[-1] // 2, None, None]
-    return jnp.where(light[None] > 0, hits - middle, 0) * safe_sqrt(light)[None]
+    hits = rays.sensor_hits
+    chief = hits[..., hits.shape[-2] // 2, None, :1]
+    return (hits[..., EXTRAS:] - chief) * safe_sqrt(rays.light)[None]
 
 
 def _rms_spot(lens: Lens, rays: FieldRays) -> Array:
@@ -188,17 +175,15 @@ def _rms_spot(lens: Lens, rays: FieldRays) -> Array:
 
 def _centroid(lens: Lens, rays: FieldRays) -> Array:
     """y of the centroids (V,), mm."""
-    hits, light = _hits(rays)
-    return safe_divide(jnp.sum(light * hits[-1], (-2, -1)), jnp.sum(light, (-2, -1)))
+    return rays.spread(rays.bundle.sensor)[1][-1][:, 0, 0]
 
 
 def _path_difference(lens: Lens, rays: FieldRays) -> Array:
     """Residuals of "path_difference", (V, W, Q), waves."""
-    of_view = lambda bundle: path_differences(lens, rays.wavelengths, bundle, None)[0]  # noqa: E731
+    of_view = lambda bundle: path_differences(lens, rays.scene.wavelengths, bundle, None)[0]  # noqa: E731
     waves = jax.vmap(of_view)(rays.bundle)[..., EXTRAS:]
-    _, light = _hits(rays)
-    mean = jnp.sum(normalised(light) * waves, axis=-1, keepdims=True)
-    return (waves - mean) * safe_sqrt(light)
+    (apart,), _ = deviations((waves,), normalised(rays.light), "none")
+    return apart * safe_sqrt(rays.light)
 
 
 def _rms_wavefront(lens: Lens, rays: FieldRays) -> Array:
@@ -208,7 +193,7 @@ def _rms_wavefront(lens: Lens, rays: FieldRays) -> Array:
 
 def _throughput(lens: Lens, rays: FieldRays) -> Array:
     """Unvignetted fraction of the light (V,)."""
-    return matmul(rays.throughput, rays.wavelength_weights)
+    return matmul(rays.throughput, rays.scene.spectrum)
 
 
 def _first_order(get: Callable[[FirstOrder], Array]) -> Function:
@@ -217,7 +202,7 @@ def _first_order(get: Callable[[FirstOrder], Array]) -> Function:
     """
 
     def values(lens: Lens, rays: FieldRays) -> Array:
-        far, waves = rays.distance[:: rays.fields], rays.wavelengths
+        far, waves = rays.scene.distance[:: rays.fields], rays.scene.wavelengths
         return jax.vmap(lambda distance: get(first_order(lens, distance, waves)))(far)
 
     return values
@@ -225,7 +210,7 @@ def _first_order(get: Callable[[FirstOrder], Array]) -> Function:
 
 def _lens_alone(get: Callable[[FirstOrder], Array]) -> Function:
     """A function that returns a first-order value that depends on wavelength alone, (W,)."""
-    return lambda lens, rays: get(first_order(lens, jnp.inf, rays.wavelengths))
+    return lambda lens, rays: get(first_order(lens, jnp.inf, rays.scene.wavelengths))
 
 
 def _back_distance(lens: Lens, rays: FieldRays) -> Array:
@@ -234,18 +219,14 @@ def _back_distance(lens: Lens, rays: FieldRays) -> Array:
 
 
 def _distortion(lens: Lens, rays: FieldRays) -> Array:
-    """(Real - paraxial image height) / paraxial image height, (V, W).
+    """(Real - paraxial image height) / paraxial image height, (V, W), see `outwards`."""
 
-    The real height is projected on the direction of the paraxial one: (h.p - p.p) / p.p.
-    """
+    def ideal_of(scene: Scene) -> Array:
+        return image_height(lens, scene.field, scene.distance, scene.wavelengths).T
 
-    def ideal_of(field: Array, distance: Array) -> Array:
-        return image_height(lens, field, distance, rays.wavelengths)
-
-    real = rays.sensor_hits[..., 0]
-    ideal = jnp.moveaxis(jax.vmap(ideal_of)(rays.field, rays.distance), 1, 0)[-len(real) :]
-    size = jnp.sum(ideal**2, axis=0)
-    return safe_divide(jnp.sum(real * ideal, axis=0) - size, size)
+    real = jnp.stack(rays.bundle.sensor, axis=-1)[..., 0, :]
+    ideal = over_points(ideal_of, rays.scene)
+    return outwards(real, ideal[..., -real.shape[-1] :])
 
 
 def _lateral_colour(lens: Lens, rays: FieldRays) -> Array:
@@ -257,9 +238,7 @@ def _lateral_colour(lens: Lens, rays: FieldRays) -> Array:
 
 def _chief_ray_angle(lens: Lens, rays: FieldRays) -> Array:
     """Angles of chief rays with the normal of the sensor, (V, W), radians."""
-    *across, along = (jnp.where(rays.arrives, a, 0)[..., 0] for a in rays.bundle.arrival)
-    sine = safe_sqrt(sum((a**2 for a in across), jnp.zeros_like(along)))
-    return jnp.arctan2(sine, jnp.where(sine + along**2 > 0, jnp.abs(along), 1))
+    return arrival_angle(lens, rays.bundle)[..., 0]
 
 
 def _numerical_aperture(lens: Lens, rays: FieldRays) -> Array:
@@ -268,13 +247,12 @@ def _numerical_aperture(lens: Lens, rays: FieldRays) -> Array:
     For unit vectors with the distance d, the sine of their angle satisfies sin^2 = d^2 (1 - d^2 /
     4).
     """
-    arrival = rays.bundle.arrival
-    lines = jnp.stack([jnp.where(rays.arrives, a, 0)[..., :EXTRAS] for a in arrival])
+    lines = jnp.stack(rays.bundle.arrival)[..., :EXTRAS]
     square = jnp.sum((lines[..., 1:] - lines[..., :1]) ** 2, axis=0)
     sines = square * (1 - square / 4)
     top, bottom, side = jnp.moveaxis(sines, -1, 0)
-    side = side if len(arrival) == 3 else top  # one radius stands for all azimuths
-    index = lens.index(rays.wavelengths)[-1]
+    side = side if len(lines) == 3 else top  # one radius stands for all azimuths
+    index = lens.index(rays.scene.wavelengths)[-1]
     return index[None] * safe_sqrt((top + bottom + 2 * side) / 4)
 
 

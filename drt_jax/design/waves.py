@@ -22,7 +22,7 @@ from ..image.transfer import strehl_of, transfer_of
 from ..image.wiener import wiener
 from ..inputs import require, shown
 from ..lens.lens import Lens
-from ..lens.scene import Scene
+from ..lens.scene import Scene, over_points
 from ..numerics import Numbers, safe_sqrt
 from ..pupil.clipped import Clipped
 from ..pupil.rules import Gauss, PupilRule, Soft
@@ -53,14 +53,17 @@ def _of_beams(lens: Lens, rays: FieldRays, function: Callable[[Beam], Any]) -> A
     azimuths = rays.rule.order if isinstance(rays.rule, Gauss | Soft) else degree
     rule = BeamRule(rays.rule, degree, azimuths=azimuths)
 
-    def one(field: Array, distance: Array, points: Vector, light: Array, bundle: Bundle) -> Any:
-        scene = Scene(field, distance, rays.wavelengths)
+    def one(scene: Scene, points: Vector, light: Array, bundle: Bundle) -> Any:
         return function(beam_of(lens, scene, rule, points, light, bundle))
 
-    # `steps` is the only field without an axis of rays; it is not used here and is replaced.
-    of_rays = rays.points, light, rays.bundle._replace(steps=light)
-    of_rays = jax.tree.map(lambda a: a[..., EXTRAS:], of_rays)
-    return jax.vmap(one)(rays.field, rays.distance, *of_rays)
+    of_rays = jax.tree.map(lambda a: a[..., EXTRAS:], (rays.points, light, rays.bundle))
+    return over_points(one, rays.scene, *of_rays)
+
+
+def _asked(rays: FieldRays, at: Numbers) -> tuple[Array, Array, Array]:
+    """Wavelengths (W,), um, `Operand.at` (1,), and weights of the wavelengths (W,)."""
+    waves = rays.scene.wavelengths
+    return waves, jnp.reshape(jnp.asarray(at, waves.dtype), 1), rays.scene.spectrum
 
 
 def mtf(lens: Lens, rays: FieldRays, at: Numbers) -> Array:
@@ -68,8 +71,7 @@ def mtf(lens: Lens, rays: FieldRays, at: Numbers) -> Array:
 
     at: frequency on the sensor, cycles/mm.
     """
-    frequency = jnp.reshape(jnp.asarray(at, rays.wavelengths.dtype), 1)
-    arguments = rays.wavelengths, frequency, rays.wavelength_weights
+    arguments = _asked(rays, at)
     transfer = lambda beam: transfer_of(lens, beam, *arguments, "waves", _CELLS)[0]  # noqa: E731
     otf = _of_beams(lens, rays, transfer)[..., 0]
     return safe_sqrt(otf.real**2 + otf.imag**2)
@@ -77,7 +79,7 @@ def mtf(lens: Lens, rays: FieldRays, at: Numbers) -> Array:
 
 def strehl(lens: Lens, rays: FieldRays) -> Array:
     """Strehl ratio (V, W), see `image.transfer.strehl`."""
-    return _of_beams(lens, rays, lambda beam: strehl_of(lens, beam, rays.wavelengths, _CELLS))
+    return _of_beams(lens, rays, lambda beam: strehl_of(lens, beam, rays.scene.wavelengths, _CELLS))
 
 
 def encircled_energy(lens: Lens, rays: FieldRays, at: Numbers) -> Array:
@@ -85,8 +87,7 @@ def encircled_energy(lens: Lens, rays: FieldRays, at: Numbers) -> Array:
 
     at: radius of the circle, mm.
     """
-    radius = jnp.reshape(jnp.asarray(at, rays.wavelengths.dtype), 1)
-    arguments = rays.wavelengths, radius, rays.wavelength_weights
+    arguments = _asked(rays, at)
     energy = lambda beam: encircled(lens, beam, *arguments, "waves", _ENERGY)  # noqa: E731
     return _of_beams(lens, rays, energy)[:, 0]
 
@@ -114,7 +115,7 @@ def psf(
     """
     what = f"rule: needs Gauss, Soft or Clipped of a higher order; got {shown(rays.rule)}"
     require(degree_of(rays.rule) >= 2, what)
-    waves = rays.wavelengths
+    waves = rays.scene.wavelengths
     options = waves, check_pixels(pixel, size, waves.dtype), kind, cells
     return _of_beams(lens, rays, lambda beam: psf_of_beam(lens, beam, *options))
 

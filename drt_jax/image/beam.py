@@ -22,7 +22,6 @@ from ..pupil.clipped import Clipped
 from ..pupil.patterns import disc, half_disc, meridian
 from ..pupil.rules import Gauss, Mask, Pattern, PupilRule, Symmetry, fits
 from ..rays.known import SEARCH, Known
-from ..rays.status import reaches_sensor
 from ..rays.system import Vector, dot
 from ..rays.trace import Bundle, trace_bundle
 from .wavefront import reference_curvature
@@ -310,12 +309,9 @@ def beam_of(
 
     Rays of a part of the pupil are repeated, rotated or mirrored, so that they cover all of it.
     """
-    known, shape = reaches_sensor(bundle.status), bundle.status.shape
+    known, shape, arrival = bundle.arrives, bundle.status.shape, bundle.arrival
     index = lens.index(scene.wavelengths)[-1]
-    hits = [jnp.where(known, h, 0) for h in bundle.hits]
-    arrival = [jnp.where(known, a, 0) for a in bundle.arrival]
-    sensor = tuple(h[-1] for h in hits)
-    path = bundle.path - index[:, None] * dot(tuple(arrival[:-1]), sensor)
+    path = bundle.path - index[:, None] * dot(arrival[:-1], bundle.sensor)
     # A constant in the path does not matter; the mean is removed so that float32 keeps the rest.
     path = jnp.where(known, path, 0)
     total = jnp.sum(known, axis=-1, keepdims=True).astype(path.dtype)
@@ -343,7 +339,7 @@ def beam_of(
     return Beam(
         points=jnp.where(arrives, spread([jnp.broadcast_to(p, shape) for p in points]), inside),
         weights=jnp.where(arrives, weights, 0),
-        hits=spread(hits),
+        hits=spread(bundle.hits),
         direction=jnp.where(arrives, direction, jnp.concatenate([inside, inside[:1]])),
         path=repeated(path),
         index=index,

@@ -37,9 +37,8 @@ from ..numerics import (
     safe_sqrt,
 )
 from ..rays.known import SEARCH, Known, known_rays
-from ..rays.status import reaches_sensor
-from ..rays.system import Vector, determinant, divide
-from ..rays.trace import FOCAL, trace_bundle
+from ..rays.system import Vector, determinant, divide, dot
+from ..rays.trace import FOCAL, Bundle, trace_bundle
 from .field import CHIEF
 from .rounding import warn_of_focus
 
@@ -151,7 +150,8 @@ def distortion(
         where it is, which is OpticStudio's reference; "fitted": calibrated, the least squares over
         the fields of the scene. A finite distance has the same formulae, with
         tan(field) = height / distance. For a lens without an axis a matrix takes the place of f,
-        the derivative of the hit at the field 0.
+        the derivative of the hit at the field 0. The operand "distortion" of a design compares with
+        the paraxial image height instead, which differs where the sensor is out of focus.
 
     ValueError for another mapping or focal length, and for points at several distances.
     """
@@ -190,18 +190,26 @@ def _distortion(
         place = place * jnp.where(size > 0, safe_divide(jnp.arctan(size), size), 1)
     ideal = einsum("wij,fj->fwi", scale, place)
     moved = jnp.where(whole[..., None], found.hit[1:] - found.hit[:1], 0)
-    along, square = jnp.sum(moved * ideal, axis=-1), jnp.sum(ideal**2, axis=-1)
-    square = jnp.where(whole, square, 0)
     if calibrated:
-        factor = safe_divide(jnp.sum(along, axis=0), jnp.sum(square, axis=0))
+        square = jnp.sum(jnp.where(whole[..., None], ideal**2, 0), axis=(0, 2))
+        factor = safe_divide(jnp.sum(moved * ideal, axis=(0, 2)), square)
         scale, ideal = scale * factor[:, None, None], ideal * factor[None, :, None]
-        along, square = along * factor[None], square * factor[None] ** 2
-    relative = jnp.where(whole, safe_divide(along - square, square), jnp.inf)
+    relative = jnp.where(whole, outwards(moved, ideal), jnp.inf)
     real, ideal = (
         jnp.where(whole[..., None], a, jnp.inf) for a in (found.hit[1:], ideal + found.hit[:1])
     )
     focal_length = jnp.where(found.whole[0], scale[:, 1, 1], jnp.inf)
     return Distortion(relative, real, ideal, focal_length)
+
+
+def outwards(real: Array, ideal: Array) -> Array:
+    """Displacements (...) of points from ideal ones, (..., D), along and relative to the distance
+    of the ideal point from the image of the axis; 0 on the axis, inf for one at infinity."""
+    near = jnp.isfinite(ideal)
+    ideal = jnp.where(near, ideal, 0)
+    square = jnp.sum(ideal**2, axis=-1)
+    moved = safe_divide(jnp.sum(real * ideal, axis=-1) - square, square)
+    return jnp.where(jnp.all(near, axis=-1), moved, jnp.inf)
 
 
 def _chief_rays(lens: Lens, scene: Scene) -> _ChiefRays:
@@ -229,20 +237,16 @@ def _chief_ray(lens: Lens, scene: Scene, known: Known) -> _ChiefRays:
     """The chief rays of one point."""
     field = scene.field
 
-    def arriving(point: Vector, field: Array) -> tuple[tuple[Vector, Array, Vector], tuple]:
-        """Hit, sag and slope at the sensor, which are differentiated; and whether the ray
-        exists, with its direction cosines."""
+    def arriving(point: Vector, field: Array) -> tuple[tuple[Vector, Array, Vector], Bundle]:
+        """Hit, sag and slope at the sensor, which are differentiated; and the rays."""
         bundle = trace_bundle(lens, scene.at(field), point, known)
-        whole = reaches_sensor(bundle.status)
-        hit = tuple(jnp.where(whole, h[-1], 0)[:, 0] for h in bundle.hits)
-        *across, along = (jnp.where(whole, a, 0)[:, 0] for a in bundle.arrival)
-        slope = tuple(safe_divide(a, along) for a in across)
+        hit, slope = (tuple(a[:, 0] for a in vector) for vector in (bundle.sensor, bundle.slopes))
         row = jax.tree.map(lambda a: a[..., -1], lens.shape)
-        return (hit, surface_sag(hit, row, lens.forms[-1]), slope), (whole[:, 0], across, along)
+        return (hit, surface_sag(hit, row, lens.forms[-1]), slope), bundle
 
     points = tuple(jnp.asarray(CHIEF, lens.curvature.dtype))
-    (hit, _, slope), jvp, rest = jax.linearize(arriving, points, field, has_aux=True)
-    whole, across, along = rest
+    (hit, _, slope), jvp, bundle = jax.linearize(arriving, points, field, has_aux=True)
+    whole, angle = bundle.arrives[:, 0], arrival_angle(lens, bundle)[:, 0]
     still, units = jax.tree.map(jnp.zeros_like, points), jnp.eye(2, dtype=field.dtype)
     # Derivatives by the stop point of the hits on the plane through the chief ray's hit: less the
     # slope times the change of the sag.
@@ -253,14 +257,20 @@ def _chief_ray(lens: Lens, scene: Scene, known: Known) -> _ChiefRays:
         columns.append(([a - m * d_sag for a, m in zip(d_hit, slope)], d_slope))
     by_field = jnp.stack([jnp.stack(jvp(still, unit)[0], axis=-1) for unit in units], axis=-1)
     tangential, sagittal = _foci(scene, columns)
-    sine = safe_sqrt(across[0] ** 2 + across[1] ** 2)
-    angle = jnp.arctan2(sine, jnp.where(whole, jnp.abs(along), 1))
-    if lens.afocal:
-        angle = safe_sqrt(hit[0] ** 2 + hit[1] ** 2) / FOCAL
     lost = lambda a: jnp.where(whole, a, jnp.inf)  # noqa: E731
     return _ChiefRays(
         jnp.stack(hit, axis=-1), lost(angle), lost(tangential), lost(sagittal), by_field, whole
     )
+
+
+def arrival_angle(lens: Lens, bundle: Bundle) -> Array:
+    """Angles (..., W, Q), radians, 0 or more, between rays and the normal of the sensor's vertex;
+    0 for a failed ray. Those that leave an afocal lens are its hits, see `rays.trace.at_infinity`.
+    """
+    if lens.afocal:
+        return safe_sqrt(dot(bundle.sensor, bundle.sensor)) / FOCAL
+    *across, along = bundle.arrival
+    return jnp.arctan2(safe_sqrt(dot(across, across)), jnp.where(bundle.arrives, jnp.abs(along), 1))
 
 
 def _foci(scene: Scene, columns: list[tuple]) -> tuple[Array, Array]:

@@ -133,9 +133,7 @@ def _of_points(
         whole = reaches_sensor(status)
         # A clipped chief ray still serves as the reference of the others.
         good = (status == Status.OK) | (whole & (np.arange(status.shape[-1]) == 0)[None])
-        *across, along = (jnp.where(whole, a, 0) for a in bundle.arrival)
-        hit = jnp.stack([jnp.where(whole, h[-1], 0) for h in bundle.hits], axis=-1)
-        slope = jnp.stack([safe_divide(a, along) for a in across], axis=-1)
+        hit, slope = (jnp.stack(a, axis=-1) for a in (bundle.sensor, bundle.slopes))
         return hit, slope, opd, good
 
     return over_points(one, scene, known)

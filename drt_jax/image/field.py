@@ -42,8 +42,7 @@ def _image_points(lens: Lens, scene: Scene) -> Array:
 def _image_point(lens: Lens, scene: Scene) -> Array:
     """`image_point` (W, 2) of one object point."""
     points = jnp.asarray(CHIEF, lens.curvature.dtype)
-    hits = trace_bundle(lens, scene, tuple(points)).hits
-    return jnp.stack([h[-1, :, 0] for h in hits], axis=-1)
+    return jnp.stack(trace_bundle(lens, scene, tuple(points)).sensor, axis=-1)[:, 0]
 
 
 def field_of_image(lens: Lens, point: Numbers, distance: Numbers, wavelength: Numbers) -> Array:

@@ -13,7 +13,7 @@ from jax import Array
 
 from ..lens.lens import Lens
 from ..lens.scene import Scene
-from ..numerics import Numbers, safe_divide
+from ..numerics import Numbers
 from ..pupil.rules import PupilRule
 from ..rays.solve import Solver, solve
 from ..rays.system import Vector
@@ -113,14 +113,10 @@ def weigh(lens: Lens, rule: PupilRule, weights: Array, bundle: Bundle) -> FocusM
     throughput = jnp.sum(weight, axis=-1)
     weight = normalised(weight)
     # Derivatives of the hits by the sensor position.
-    slope = tuple(safe_divide(a, bundle.arrival[-1]) for a in bundle.arrival[:-1])
-    motion = lens.sensor_motion
+    slope, motion = bundle.slopes, lens.sensor_motion
     if motion is not None:
         slope = tuple(s * motion[2] - motion[k] for k, s in enumerate(slope))
-    counts = weight != 0
-    hit = tuple(jnp.where(counts, h[-1], 0) for h in bundle.hits)
-    slope = tuple(jnp.where(counts, s, 0) for s in slope)
-    (x, mean), (u, tilt) = (deviations(v, weight, rule.symmetry) for v in (hit, slope))
+    (x, mean), (u, tilt) = (deviations(v, weight, rule.symmetry) for v in (bundle.sensor, slope))
     pairs = (1, x, x), (2, x, u), (1, u, u)
     spread = [k * mean_products(a, b, weight, rule.symmetry) for k, a, b in pairs]
     return FocusMoments(lens.sensor, _plane(mean), _plane(tilt), jnp.stack(spread), throughput)

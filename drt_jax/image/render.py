@@ -28,7 +28,6 @@ from ..lens.paraxial import first_order
 from ..lens.scene import NEAREST, Scene, checked_scene, over_points, vergence_of
 from ..numerics import Numbers, concrete, einsum, safe_divide, safe_sqrt
 from ..rays.solve import solve_aimed
-from ..rays.status import reaches_sensor
 from ..rays.trace import trace_bundle
 from .beam_psf import Kind, Sampling
 from .fields import grid_method
@@ -268,8 +267,7 @@ def _chief_points(lens: Lens, scene: Scene) -> Array:
     def one(point: Scene) -> Array:
         centre = jnp.zeros(1, lens.curvature.dtype)
         bundle = trace_bundle(lens, point, (centre, centre), solve_aimed)
-        hits = jnp.concatenate([h[-1] for h in bundle.hits], axis=-1)
-        return jnp.where(reaches_sensor(bundle.status), hits, jnp.inf)
+        return jnp.where(bundle.arrives, jnp.concatenate(bundle.sensor, axis=-1), jnp.inf)
 
     return over_points(one, scene)
 

@@ -16,7 +16,6 @@ follows; Slater, Remote Sensing (1980), for the cone at a point of the sensor.
 
 import dataclasses
 import functools
-from collections.abc import Callable
 from typing import Any, Literal, get_args
 
 import jax
@@ -29,15 +28,15 @@ from ..inputs import require_one_of
 from ..lens.lens import Lens
 from ..lens.order import may_cross
 from ..lens.scene import Scene, checked_scene, over_points
-from ..numerics import batched, known_values, safe_divide, safe_sqrt
+from ..numerics import known_values, safe_divide, safe_sqrt
 from ..pupil.clipped import Clipped
 from ..pupil.patterns import hexapolar
 from ..pupil.rules import Gauss, PupilRule, planned, symmetry_of
 from ..rays.known import Known, known_rays, tiles, trace_tile, wide
-from ..rays.solve import solve, solve_aimed
-from ..rays.status import Status, reaches_sensor
+from ..rays.solve import Solver, solve, solve_aimed
+from ..rays.status import Status
 from ..rays.system import Vector, determinant, divide
-from ..rays.trace import trace_bundle
+from ..rays.trace import Bundle, trace_bundle
 from .converged import converged_rule
 from .rounding import check_dtype, hit_rounding
 from .spot import normalised
@@ -116,12 +115,7 @@ def spot_diagram(
     `lens.scene.checked_scene`; without a rule inside a trace.
     """
     scene = checked_scene(lens, scene)
-    middle, spectrum = scene.reference(reference), scene.spectrum
-    light = _light(lens, scene, sampling, "object")
-    colour = scene.wavelengths[middle]
-    index = lens.index(colour)[-1, 0]
-    settings = spectrum / jnp.sum(spectrum), colour / index, middle
-    found = _spots(light, *settings)
+    found = _light(lens, scene, sampling, "object", reference)
     known = known_values((lens, found.rms))
     if known is not None:
         wrong = hit_rounding(known[0]) / max(float(jnp.min(known[1])), np.finfo(float).tiny)
@@ -160,7 +154,7 @@ def relative_illumination(
     light = _light(lens, scene.with_axis(), sampling, point)
     area = light.solid_angle
     if point == "object":
-        level = _collimated(lens, jax.tree.map(lambda a: a[0], light), scene.wavelengths)
+        level = _collimated(lens, light.rms[0], area[0], scene.wavelengths)
         known = known_values(level)
         if known is not None and bool(jnp.any(known)):
             raise ValueError(
@@ -251,90 +245,89 @@ def _even() -> np.ndarray:
     return hexapolar(_RINGS)[0]
 
 
-@jax.tree_util.register_dataclass
-@dataclasses.dataclass(frozen=True)
-class _Light:
-    """Rays and light of object points (...).
-
-    hit: (..., W, Q, 2), mm. Along Q: mirror images of the rays of the rule (if it is bilateral),
-        the rays of the rule, the chief ray, and those on the rim.
-    weight: (..., W, Q); 0 for chief ray and rim.
-    arrives: (..., W, Q), bool.
-    chief: (..., W, 2), mm, hit of the chief ray.
-    chief_whole: (..., W), bool, False where the chief ray fails.
-    throughput, solid_angle, left_out: (..., W), as in `Spots`.
-    """
-
-    hit: Array
-    weight: Array
-    arrives: Array
-    chief: Array
-    chief_whole: Array
-    throughput: Array
-    solid_angle: Array
-    left_out: Array
-
-
-def _collimated(lens: Lens, light: _Light, wavelengths: Array) -> Array:
+def _collimated(lens: Lens, rms: Array, cone: Array, wavelengths: Array) -> Array:
     """Whether the image of an object point is farther away than `_FAR` times the exit pupil, (W,).
-    There the light has no cone, and the hits show the width of the beam: the solid angle is
-    below pi var (kappa / _FAR)^2, var the variance of the hits, 1 / kappa the distance of the
-    exit pupil."""
-    hit, weight = light.hit, light.weight
-    share = normalised(weight)[..., None]
-    square = jnp.sum(share * (hit - jnp.sum(share * hit, axis=1, keepdims=True)) ** 2, axis=(1, 2))
+    There the light has no cone, and the RMS radius (), mm, shows the width of the beam: the solid
+    angle (W,) is below pi (rms kappa / _FAR)^2, 1 / kappa the distance of the exit pupil."""
     kappa = reference_curvature(lens, jnp.clip(wavelengths, *lens.dispersion.range))
-    return light.solid_angle < np.pi * square * (kappa / _FAR) ** 2
+    wide = jnp.where(jnp.isfinite(rms), rms, 0)  # inf without light
+    return cone < np.pi * (wide * kappa / _FAR) ** 2
 
 
-def _light(lens: Lens, scene: Scene, sampling: float | PupilRule | None, point: Point) -> _Light:
-    """The light of all points of a scene that fits the lens."""
+def _light(
+    lens: Lens, scene: Scene, sampling: float | PupilRule | None, point: Point,
+    reference: int | None = None
+) -> Spots:  # fmt: skip
+    """The spots of all points of a scene that fits the lens; their solid angles are those of
+    `point`."""
     require_one_of("point", point, get_args(Point))
+    middle = np.int32(scene.reference(reference))
     rule = rule_for(lens, scene, sampling)
-    return _traced(lens, scene, rule, point == "sensor", known_rays(lens, scene, rule, _aim))
+    known = known_rays(lens, scene, rule, _aim)
+    return _traced(lens, scene, rule, middle, point == "sensor", known)
 
 
 @functools.partial(jit, wanted=LARGE, static_argnames="fixed")
-def _traced(lens: Lens, scene: Scene, rule: PupilRule, fixed: bool, known: Known) -> _Light:
+def _traced(
+    lens: Lens, scene: Scene, rule: PupilRule, middle: Array, fixed: bool, known: Known
+) -> Spots:
     """`_light`, compiled. fixed: True for the cone at a point of the sensor, False for that of an
     object point."""
-    return over_points(lambda *one: _of_point(lens, rule, fixed, *one), scene, known)
+    return over_points(lambda *one: _of_point(lens, rule, middle, fixed, *one), scene, known)
 
 
-def _of_point(lens: Lens, rule: PupilRule, fixed: bool, scene: Scene, known: Known) -> _Light:
-    """The light of one object point."""
+def _of_point(
+    lens: Lens, rule: PupilRule, middle: Array, fixed: bool, scene: Scene, known: Known
+) -> Spots:
+    """The spots of one object point. middle: (), index of the reference wavelength.
+
+    Their rays are, along Q: mirror images of the rays of the rule (if it is bilateral), the rays of
+    the rule, the chief ray, and those on the rim.
+    """
     points, weights = _whole_rule(scene, *rule.points(lens, scene, known.plan))
     count = weights.shape[-1]
-
-    def arriving(points: Vector, field: Array) -> tuple[tuple[Vector, Vector], tuple]:
-        """Hits and transverse direction cosines at the sensor, which are differentiated; status
-        and transmission."""
-        bundle = trace_bundle(lens, scene.at(field), points, known)
-        whole = reaches_sensor(bundle.status)
-        hit = tuple(jnp.where(whole, h[-1], 0) for h in bundle.hits)
-        line = tuple(jnp.where(whole, a, 0) for a in bundle.arrival[:-1])
-        return (hit, line), (bundle.status, rule.transmission(lens, bundle))
-
-    ends = jax.linearize(arriving, points, scene.field, has_aux=True)
-    (hit, _), jvp, (status, passes) = ends
-    area = np.pi * jnp.abs(direction_determinant(jvp, points, scene.field, fixed))[:, :count]
-    weight = weights * passes[:, :count]
-    throughput, cone = jnp.sum(weight, axis=-1), jnp.sum(weight * area, axis=-1)
-    arrives = status == Status.OK
-    failed = ~reaches_sensor(status)
-    left_out = jnp.mean(failed[:, 1 - len(_extra_points()) :].astype(weight.dtype), axis=-1)
-    traced = slice(0, -len(_even()))
-    parts = [jnp.stack(hit, axis=-1)[:, traced], arrives[:, traced]]
+    bundle, area = cones(lens, scene, points, known, fixed)
+    weight = weights * rule.transmission(lens, bundle)[:, :count]
+    throughput, cone = jnp.sum(weight, -1), jnp.sum(weight * (np.pi * area[:, :count]), -1)
+    failed = ~bundle.arrives[:, 1 - len(_extra_points()) :]
+    hit, arrives = jnp.stack(bundle.sensor, axis=-1), bundle.status == Status.OK
+    chief, whole = hit[middle, count], bundle.arrives[middle, count]
+    hit, arrives = (a[:, : -len(_even())] for a in (hit, arrives))
     weight = jnp.pad(weight, ((0, 0), (0, 1 + _RIM)))
     if rule.symmetry == "bilateral":  # add the mirror images of the rays of the rule
-        images = parts[0][:, :count] * jnp.array([[[-1, 1]]], weight.dtype), arrives[:, :count]
-        parts = [jnp.concatenate(pair, axis=1) for pair in zip(images, parts)]
+        images = hit[:, :count] * jnp.array([[[-1, 1]]], weight.dtype), arrives[:, :count]
+        hit, arrives = (jnp.concatenate(pair, axis=1) for pair in zip(images, (hit, arrives)))
         weight = jnp.concatenate([weight[:, :count], weight], axis=1) / 2
-    hits, arrives = parts
-    chief = status[:, count]
-    whole = reaches_sensor(chief)
-    chief_hit = jnp.stack([h[:, count] for h in hit], axis=-1)
-    return _Light(hits, weight, arrives, chief_hit, whole, throughput, cone, left_out)
+    weight = weight * (scene.spectrum / jnp.sum(scene.spectrum))[:, None]
+    share = normalised(weight, (0, 1))
+    centroid = jnp.sum(share[..., None] * hit, axis=(0, 1))
+    good = jnp.sum(weight) > 0
+
+    def spread(centre: Array, good: Array) -> tuple[Array, Array]:
+        """RMS and largest distance from `centre`; inf where not `good`."""
+        square = jnp.sum((hit - centre[None, None]) ** 2, axis=-1)
+        mean = safe_sqrt(jnp.sum(share * square))
+        largest = safe_sqrt(jnp.max(jnp.where(arrives, square, 0)))
+        return jnp.where(good, mean, jnp.inf), jnp.where(good, largest, jnp.inf)
+
+    (rms, radius), (rms_chief, radius_chief) = spread(centroid, good), spread(chief, good & whole)
+    aperture = safe_sqrt(cone[middle] / np.pi)
+    colour = scene.wavelengths[middle] / lens.index(scene.wavelengths)[-1, middle]
+    airy = jnp.where(aperture > 0, safe_divide(_AIRY * colour, aperture), jnp.inf)
+    return Spots(
+        jnp.where(arrives[..., None], hit, jnp.inf),
+        weight,
+        jnp.where(good, centroid, jnp.inf),
+        jnp.where(whole, chief, jnp.inf),
+        rms,
+        rms_chief,
+        radius,
+        radius_chief,
+        airy,
+        throughput,
+        cone,
+        jnp.mean(failed.astype(cone.dtype), axis=-1),
+    )
 
 
 def _aim(lens: Lens, scene: Scene, rule: PupilRule) -> tuple[Vector, Any]:
@@ -360,16 +353,25 @@ def _whole_rule(scene: Scene, points: Vector, weights: Array) -> tuple[Vector, A
     return tuple(jnp.concatenate(pair, axis=-1) for pair in joined), weights
 
 
-def direction_determinant(jvp: Callable, points: Vector, field: Array, fixed: bool) -> Array:
-    """Determinants dl / dp (W, Q) of the directions by the stop points.
+def cones(
+    lens: Lens, scene: Scene, points: Vector, solver: Solver, fixed: bool
+) -> tuple[Bundle, Array]:
+    """Rays of an object point, and |dl / dp| (W, Q), the area of their transverse direction cosines
+    l at the sensor for each area of the stop, whose points are p.
 
-    jvp: derivatives (h, l) of hits and directions, as a function of tangents of points and field.
-    points: stop points, 2 arrays (W, Q).
-    field: (2,).
+    lens, scene, solver: as in `trace_bundle`.
+    points: stop points, 2 arrays (Q,) or (W, Q).
     fixed: False for a fixed object point: the determinant of l_p. True for a fixed point of the
         sensor: there the field changes with p by df = -h_f^-1 h_p dp, so it is the determinant of
         l_p - l_f h_f^-1 h_p.
     """
+
+    def arriving(points: Vector, field: Array) -> tuple[tuple[Vector, Vector], Bundle]:
+        bundle = trace_bundle(lens, scene.at(field), points, solver)
+        return (bundle.sensor, bundle.arrival[:-1]), bundle
+
+    field = scene.field
+    _, jvp, bundle = jax.linearize(arriving, points, field, has_aux=True)
     zero, units = jax.tree.map(jnp.zeros_like, points), jnp.eye(2, dtype=field.dtype)
     sides = [tuple(jnp.full_like(p, float(j == k)) for j, p in enumerate(points)) for k in range(2)]
     columns = []
@@ -380,52 +382,4 @@ def direction_determinant(jvp: Callable, points: Vector, field: Array, fixed: bo
             back = divide(tuple(zip(hit_x, hit_y)), hit)
             line = [a - back[0] * b - back[1] * c for a, b, c in zip(line, line_x, line_y)]
         columns.append(line)
-    return determinant(columns)
-
-
-@functools.partial(jax.jit, static_argnames="middle")
-def _spots(light: _Light, spectrum: Array, wavelength: Array, middle: int) -> Spots:
-    """`Spots` of the light of object points (...).
-
-    wavelength: the reference wavelength in the medium of the sensor, um.
-    """
-    one = lambda light: _spot(light, spectrum, wavelength, middle)  # noqa: E731
-    return batched(one, light.throughput.ndim - 1)(light)
-
-
-def _spot(light: _Light, spectrum: Array, wavelength: Array, middle: int) -> Spots:
-    """`_spots` of one object point."""
-    weight = light.weight * spectrum[:, None]
-    hit = light.hit
-    lit = jnp.sum(weight)
-    share = safe_divide(weight, jnp.broadcast_to(lit, weight.shape))
-    centroid = jnp.sum(share[..., None] * hit, axis=(0, 1))
-    chief = light.chief[middle]
-    good = lit > 0
-    whole = good & light.chief_whole[middle]
-
-    def spread(centre: Array, good: Array) -> tuple[Array, Array]:
-        """RMS and largest distance from `centre`; inf where not `good`."""
-        square = jnp.sum((hit - centre[None, None]) ** 2, axis=-1)
-        mean = safe_sqrt(jnp.sum(share * square))
-        largest = safe_sqrt(jnp.max(jnp.where(light.arrives, square, 0)))
-        return jnp.where(good, mean, jnp.inf), jnp.where(good, largest, jnp.inf)
-
-    (rms, radius), (rms_chief, radius_chief) = spread(centroid, good), spread(chief, whole)
-    cone = light.solid_angle[middle]
-    aperture = safe_sqrt(cone / np.pi)
-    airy = jnp.where(aperture > 0, safe_divide(_AIRY * wavelength, aperture), jnp.inf)
-    return Spots(
-        jnp.where(light.arrives[..., None], hit, jnp.inf),
-        weight,
-        jnp.where(good, centroid, jnp.inf),
-        jnp.where(light.chief_whole[middle], chief, jnp.inf),
-        rms,
-        rms_chief,
-        radius,
-        radius_chief,
-        airy,
-        light.throughput,
-        light.solid_angle,
-        light.left_out,
-    )
+    return bundle, jnp.abs(determinant(columns))

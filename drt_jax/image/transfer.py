@@ -26,7 +26,7 @@ from ..lens.lens import Lens
 from ..lens.scene import Scene, checked_scene
 from ..numerics import Numbers, einsum, real_array, safe_divide, safe_sqrt
 from ..pupil.rules import PupilRule
-from .beam import Beam, BeamRule, beam_rule
+from .beam import Beam, BeamRule, beam_rule, means
 from .beam_psf import DEGREE, Sampling
 from .cover import cover
 from .refined import TOLERANCE, beams_of, to_tolerance
@@ -207,7 +207,7 @@ def centre_of(beam: Beam, spectrum: Array) -> tuple[Array, Array]:
     spectrum: (W,), weights of the wavelengths in the light that fills the stop.
     """
     share = normalised(spectrum * beam.throughput)
-    centre = einsum("w,wq,dwq->d", share, normalised(beam.weights), beam.hits[:, -1])
+    centre = einsum("w,dw->d", share, means(beam.hits[:, -1], beam.weights))
     return share, centre
 
 

@@ -26,10 +26,11 @@ from ..lens.scene import Scene, checked_scene, over_points
 from ..numerics import Numbers, concrete, real_array, safe_divide, safe_sqrt
 from ..rays.known import Known, known_rays
 from ..rays.rays import stop_points
-from ..rays.status import Status, reaches_sensor
+from ..rays.status import Status
 from ..rays.system import dot
 from ..rays.trace import FOCAL, Bundle, trace_bundle
 from .rounding import warn_of_paths
+from .spot import deviations, normalised
 
 _MM = 1e-3  # per um
 
@@ -127,7 +128,7 @@ def path_differences(
     Returns path differences (W, Q), waves, status (W, Q) and image points (W, D), mm.
     """
     waves = jnp.clip(wavelengths, *lens.dispersion.range)
-    whole = reaches_sensor(bundle.status)
+    whole, hit = bundle.arrives, bundle.sensor
     chief_ok = whole[:, :1]
 
     if curvature is None:
@@ -143,8 +144,7 @@ def path_differences(
     cosine = jnp.abs(dot(axis[-len(arrival) :], arrival))
     kappa = (curvature * cosine)[:, None]
 
-    hit = tuple(h[-1] for h in bundle.hits)
-    image = tuple(jnp.where(chief_ok, h[:, :1], 0) for h in hit)
+    image = tuple(h[:, :1] for h in hit)
     e = tuple(jnp.where(good, h - i, 0) for h, i in zip(hit, image, strict=True))
     along = dot(e, bundle.arrival[:-1])
     x = along**2 - dot(e, e)
@@ -168,7 +168,6 @@ def rms_wavefront(wave: Wavefront, weights: Numbers) -> Array:
     weight = real_array("weights", weights, wave.opd.dtype)
     if weight.shape != wave.opd.shape[-1:]:
         raise ValueError(f"weights: expected {wave.opd.shape[-1:]}, got shape {weight.shape}")
-    weight = jnp.where(wave.status == Status.OK, weight, 0)
-    weight = safe_divide(weight, jnp.sum(weight, axis=-1, keepdims=True))
-    mean = jnp.sum(weight * wave.opd, axis=-1, keepdims=True)
-    return safe_sqrt(jnp.sum(weight * (wave.opd - mean) ** 2, axis=-1))
+    weight = normalised(jnp.where(wave.status == Status.OK, weight, 0))
+    (apart,), _ = deviations((wave.opd,), weight, "none")
+    return safe_sqrt(jnp.sum(weight * apart**2, axis=-1))

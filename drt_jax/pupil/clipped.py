@@ -24,7 +24,6 @@ from jax import Array
 from ..lens.lens import Lens
 from ..lens.scene import Scene
 from ..numerics import Numbers, brief, eager_values, safe_divide
-from ..rays.status import reaches_sensor
 from ..rays.system import Vector, determinant, dot, system_of
 from ..rays.trace import Bundle
 from . import boundary
@@ -99,8 +98,7 @@ class Fitted(PupilRule):
 
     def transmission(self, lens: Lens, bundle: Bundle) -> Array:
         """1 (W, Q) for every ray that exists, clipped or not; 0 for rays that fail."""
-        whole = reaches_sensor(bundle.status)
-        return whole.astype(bundle.path.dtype)
+        return bundle.arrives.astype(bundle.path.dtype)
 
 
 @jax.tree_util.register_dataclass

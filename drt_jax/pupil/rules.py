@@ -25,7 +25,7 @@ from ..lens.lens import Lens
 from ..lens.scene import Scene, checked_scene, over_points
 from ..numerics import Numbers, brief, concrete, real_array, safe_divide
 from ..rays.known import Known, known_rays
-from ..rays.status import Status, reaches_sensor
+from ..rays.status import Status
 from ..rays.system import Vector
 from ..rays.trace import Bundle
 from . import patterns
@@ -191,12 +191,11 @@ class Soft(PupilRule):
     def transmission(self, lens: Lens, bundle: Bundle) -> Array:
         """Product (W, Q) of the transmissions of all apertures and obscurations except the rim
         of the stop; 0 for rays that fail."""
-        whole = reaches_sensor(bundle.status)
         inside = clearance(lens, bundle.hits)
         bounded = jnp.isfinite(inside)  # its derivative by the width would be NaN
         inside = jnp.where(bounded, inside, 0) / jnp.asarray(self.width, inside.dtype)
         steps = jax.nn.sigmoid(jnp.where(bounded, inside, jnp.inf))
-        return jnp.where(whole, jnp.prod(steps, axis=0), 0)
+        return jnp.where(bundle.arrives, jnp.prod(steps, axis=0), 0)
 
 
 @jax.tree_util.register_dataclass

@@ -16,7 +16,6 @@ from ..lens.surface import by_form, surface_sag
 from ..numerics import Numbers, concrete, known_values, real_array
 from . import fermat
 from .known import Known, known_rays
-from .status import reaches_sensor
 from .system import add, placed, rotate
 from .trace import aims, bundle_of, rows_behind
 
@@ -111,7 +110,6 @@ def _trace_point(lens: Lens, pupil: Array, scene: Scene, known: Known) -> Rays:
     system, target = aims(lens, scene, (pupil[:, 0], pupil[:, 1]))
     found = known(system, target)
     bundle = bundle_of(dataclasses.replace(lens, afocal=False), scene, system, target, found)
-    exists = reaches_sensor(bundle.status)
     rows = placed(lens, range(lens.count + 1))
     heights = by_form(surface_sag, bundle.hits, rows.wide, lens.forms)
     own = rotate(rows.rotation, (*bundle.hits, heights))
@@ -120,8 +118,8 @@ def _trace_point(lens: Lens, pupil: Array, scene: Scene, known: Known) -> Rays:
     behind = np.array(rows_behind(lens))
 
     def stacked(vector):  # (3, S + 1, W, Q) -> (W, Q, S + 1, 3)
-        return jnp.where(exists, jnp.stack(vector), 0).transpose(2, 3, 1, 0)
+        return jnp.where(bundle.arrives, jnp.stack(vector), 0).transpose(2, 3, 1, 0)
 
     directions = stacked([d[behind] for d in direction])
-    path = jnp.where(exists, fermat.optical_path(found.hits, system), 0)
-    return Rays(stacked(points), directions, path, bundle.status, bundle.steps)
+    path = jnp.where(bundle.arrives, fermat.optical_path(found.hits, system), 0)
+    return Rays(stacked(points), directions, path, bundle.status, found.steps)

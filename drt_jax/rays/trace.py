@@ -18,7 +18,7 @@ from . import fermat
 from .find import Found
 from .meet import cross
 from .solve import Solver, solve
-from .status import Status
+from .status import Status, reaches_sensor
 from .system import System, Vector, dot, placed, rotate, system_of, where
 
 # Focal length F of the ideal lens behind an afocal system, mm, so that 1 mm is 1 mrad.
@@ -26,15 +26,16 @@ FOCAL = 1e3
 
 
 class Bundle(NamedTuple):
-    """Rays as arrays with rays on the last axis.
+    """Rays as arrays with rays on the last axis. Those of several object points (...) are the first
+    axes of all arrays.
 
-    hits: D arrays (S + 1, W, Q), mm along the axes of each surface and of the sensor.
+    hits: D arrays (S + 1, W, Q), mm along the axes of each surface and of the sensor; 0 for a
+        failed ray.
     status: (W, Q), int32, see `Status`.
-    arrival: D + 1 arrays (W, Q), unit vectors at the sensor, along its axes.
+    arrival: D + 1 arrays (W, Q), unit vectors at the sensor, along its axes; 0 for a failed ray.
     path: (W, Q), optical path from the object, mm, less the path through the mean hits of the rays
         of the same wavelength. The mean hits count as constants in derivatives, see
         `fermat.optical_path`.
-    steps: (), int32, Newton steps.
 
     In an afocal lens the hits on the sensor, the arrival and the path are those of `at_infinity`.
     """
@@ -43,7 +44,21 @@ class Bundle(NamedTuple):
     status: Array
     arrival: Vector
     path: Array
-    steps: Array
+
+    @property
+    def arrives(self) -> Array:
+        """Mask (W, Q) of the rays that meet the sensor, clipped or not."""
+        return reaches_sensor(self.status)
+
+    @property
+    def sensor(self) -> Vector:
+        """Hits on the sensor, D arrays (W, Q), mm; 0 for a failed ray."""
+        return tuple(h[..., -1, :, :] for h in self.hits)
+
+    @property
+    def slopes(self) -> Vector:
+        """Slopes of the rays at the sensor, D arrays (W, Q); 0 for a failed ray."""
+        return tuple(safe_divide(a, self.arrival[-1]) for a in self.arrival[:-1])
 
 
 def rows_behind(lens: Lens) -> list[int]:
@@ -122,7 +137,7 @@ def bundle_of(lens: Lens, scene: Scene, system: System, target: Vector, found: F
     path = path_of(found, system)
     if lens.afocal:
         hits, arrival, path = at_infinity(hits, arrival, path, exists, system.index[-1])
-    return Bundle(hits, status, arrival, path, found.steps)
+    return Bundle(hits, status, where(exists, arrival, 0), path)
 
 
 def at_infinity(

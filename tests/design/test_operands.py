@@ -30,6 +30,7 @@ from drt_jax.lens.glasses import glass_map_distance
 from drt_jax.lens.paraxial import image_height
 from drt_jax.pupil import pupil_points
 
+from ..image.test_afocal import LENS as TELESCOPE
 from .test_variables import MODEL
 
 COLOURS, WEIGHTS = (0.48, 0.55, 0.65), np.array([0.25, 0.5, 0.25])
@@ -46,6 +47,12 @@ def program(problem, kinds):
         return {kind: Operand(kind).values(lens, rays) for kind in kinds}
 
     return jit(values, LARGE)
+
+
+def values_of(lens, kinds, scene, rule):
+    """The values of kinds, by name, of a lens as it is."""
+    problem = Problem.from_variables(Variables.from_lens(lens, ["sensor"]), kinds, scene, rule)
+    return program(problem, kinds)(problem, problem.variables.start)
 
 
 @pytest.fixture(scope="module")
@@ -272,6 +279,29 @@ def test_illumination_of_a_thin_lens(tmp_path, semi, rule):
     # What is left of the stop lies to one side of its middle.
     near = 2e-3 if semi == 100 else 1e-2
     assert abs(found[1] / (np.cos(fields[1]) ** 4 * share) - 1) < near
+
+
+@pytest.mark.slow
+def test_operands_of_an_afocal_lens_are_its_analyses():
+    """Angles, the light on a pixel, no paraxial image; on the axis no centroid."""
+    scene, rule = Scene.radians([0.0, 0.002, 0.004], np.inf, 0.5), Gauss(6, "bilateral")
+    told = values_of(TELESCOPE, ["chief_ray_angle", "relative_illumination"], scene, rule)
+    angles = drt_jax.chief_ray_angle(TELESCOPE, scene)[:, 0]
+    np.testing.assert_allclose(told["chief_ray_angle"], angles, rtol=1e-12)
+    light = drt_jax.relative_illumination(TELESCOPE, scene, rule, "sensor")[:, 0]
+    np.testing.assert_allclose(told["relative_illumination"], light, rtol=1e-12)
+    with pytest.raises(ValueError, match="distortion: an afocal lens has no image height"):
+        values_of(TELESCOPE, ["distortion"], scene, rule)
+
+
+@pytest.mark.slow
+def test_a_centroid_on_the_axis_is_there():
+    """Rays on one radius stand for all azimuths."""
+    lens, scene = load_lens("singlet"), Scene.radians([0.0], np.inf, COLOURS)
+    told = values_of(lens, ["centroid", "rms_spot"], scene, Gauss(4, "rotational"))
+    whole = values_of(lens, ["rms_spot"], scene, Gauss(4, "none"))
+    np.testing.assert_allclose(told["rms_spot"], whole["rms_spot"], rtol=1e-12)
+    np.testing.assert_array_equal(told["centroid"], [0.0])
 
 
 @pytest.mark.slow
