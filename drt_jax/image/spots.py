@@ -116,15 +116,11 @@ def spot_diagram(
     `lens.scene.checked_scene`; without a rule inside a trace.
     """
     scene = checked_scene(lens, scene)
-    middle, spectrum = scene.reference(reference), scene.spectrum
     light = _light(lens, scene, sampling, "object")
-    colour = scene.wavelengths[middle]
-    index = lens.index(colour)[-1, 0]
-    settings = spectrum / jnp.sum(spectrum), colour / index, middle
-    found = _spots(light, *settings)
+    found = _spots(lens, scene, light, scene.reference(reference))
     known = known_values((lens, found.rms))
     if known is not None:
-        wrong = hit_rounding(known[0]) / max(float(jnp.min(known[1])), np.finfo(float).tiny)
+        wrong = hit_rounding(known[0]) / max(np.min(np.asarray(known[1])), np.finfo(float).tiny)
         check_dtype(known[0], "spots", wrong, _ROUGH, " of their size")
     return found
 
@@ -384,17 +380,20 @@ def direction_determinant(jvp: Callable, points: Vector, field: Array, fixed: bo
 
 
 @functools.partial(jax.jit, static_argnames="middle")
-def _spots(light: _Light, spectrum: Array, wavelength: Array, middle: int) -> Spots:
-    """`Spots` of the light of object points (...).
-
-    wavelength: the reference wavelength in the medium of the sensor, um.
-    """
+def _spots(lens: Lens, scene: Scene, light: _Light, middle: int) -> Spots:
+    """`Spots` of the light of the points of a scene. middle: index of the reference wavelength."""
+    spectrum, colour = scene.spectrum, scene.wavelengths[middle]
+    spectrum, wavelength = spectrum / jnp.sum(spectrum), colour / lens.index(colour)[-1, 0]
     one = lambda light: _spot(light, spectrum, wavelength, middle)  # noqa: E731
     return batched(one, light.throughput.ndim - 1)(light)
 
 
 def _spot(light: _Light, spectrum: Array, wavelength: Array, middle: int) -> Spots:
-    """`_spots` of one object point."""
+    """`_spots` of one object point.
+
+    spectrum: weights of the wavelengths, of the sum 1. wavelength: the reference wavelength in the
+        medium of the sensor, um.
+    """
     weight = light.weight * spectrum[:, None]
     hit = light.hit
     lit = jnp.sum(weight)
