@@ -2,7 +2,6 @@
 clipping of the beam of a field by the apertures.
 """
 
-import dataclasses
 import functools
 import itertools
 import math
@@ -169,8 +168,8 @@ class _Traced(NamedTuple):
 
 
 @functools.partial(jit, wanted=ONCE)
-def _in_own_axes(lens: Lens, rays: Rays) -> _Traced:
-    """Rays on the axes of the surfaces."""
+def _in_own_axes(lens: Lens, rays: Rays) -> tuple[jax.Array, ...]:
+    """The parts of `_Traced`."""
     vertex, across, turned = lens.places
     across = jnp.zeros((len(vertex), 2), vertex.dtype) if across is None else across
     own = rays.points - jnp.concatenate([across, vertex[:, None]], axis=1)[None, None]
@@ -179,14 +178,14 @@ def _in_own_axes(lens: Lens, rays: Rays) -> _Traced:
         own = einsum("wqsi,sij->wqsj", own, turned)
         directions = directions @ turned[-1]
     clips = clipping_surface(lens, tuple(jnp.moveaxis(own, (3, 2), (0, 1))[:2]))
-    return _Traced(rays.points, own[..., :2], directions, rays.status, clips)
+    return rays.points, own[..., :2], directions, rays.status, clips
 
 
 def _traced(lens: Lens, scene: Scene, pupil: np.ndarray) -> _Traced:
     """Rays through points (Q, 2) of the stop, in units of its radius."""
     filled = np.resize(pupil, (-(-len(pupil) // _RAYS) * _RAYS, 2))
     found = _in_own_axes(lens, trace_rays(lens, scene, filled))
-    return jax.tree.map(lambda a: np.asarray(a)[:, : len(pupil)], found)
+    return _Traced(*(np.asarray(a)[:, : len(pupil)] for a in found))
 
 
 def _fan(lens: Lens, scene: Scene, rays: int) -> _Traced:

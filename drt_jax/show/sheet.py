@@ -83,16 +83,16 @@ class Results(NamedTuple):
     line: np.ndarray
     foci: FieldCurvature
     bent: Distortion
-    colour: Array
+    colour: np.ndarray
     fans: RayFans
     spots: Spots
     hits: np.ndarray
     lines: np.ndarray
-    contrast: Array
-    limit: Array
-    over_field: Array
-    radii: Array
-    energy: Array
+    contrast: np.ndarray
+    limit: np.ndarray
+    over_field: np.ndarray
+    radii: np.ndarray
+    energy: np.ndarray
     model: Model
     third: ThirdOrder | str
 
@@ -205,7 +205,7 @@ def analysed(
     widest = max(map(abs, angles)) * (1 if max(angles) >= -min(angles) else -1)
     line = np.linspace(0, widest, _CURVE)
     at = lambda fields: checked_scene(  # noqa: E731
-        lens, scene.at(np.stack([0 * (a := np.asarray(fields)), a], axis=-1))
+        lens, scene.at(jnp.asarray(np.stack([0 * (a := np.asarray(fields)), a], axis=-1)))
     )
     say("tracing chief rays")
     foci, bent, colour = jax.tree.map(np.asarray, along_field(lens, at(line)))
@@ -222,7 +222,7 @@ def analysed(
     lines = np.linspace(0, highest(limit, spots.rms[: len(some)]), _FREQUENCIES)
     radii, model, cells = _circles(spots, len(some))
     beams = beams_of(lens, at(wide), beam_rule(_DEGREE, rule.symmetry, rule))
-    asked = scene.wavelengths, scene.spectrum, lines, radii
+    asked = scene.wavelengths, scene.spectrum, *map(jnp.asarray, (lines, radii))
     waves = _waves(lens, beams, asked, len(some), model, cells)
     third: ThirdOrder | str
     try:
@@ -246,7 +246,7 @@ def shown_fields(lens: Lens, scene: Scene) -> tuple[Scene, list[float]]:
     count = min(len(angles), len(FIELD_COLOURS))
     picked = np.round(np.linspace(0, len(angles) - 1, count)).astype(int)
     field = np.stack([0 * angles[picked], angles[picked]], axis=-1)
-    return checked_scene(lens, scene.at(field)), np.delete(angles, picked).tolist()
+    return checked_scene(lens, scene.at(jnp.asarray(field))), np.delete(angles, picked).tolist()
 
 
 _third_order = jit(third_order, ONCE)
@@ -292,7 +292,7 @@ def _draw_fields(axes: dict[str, list[Axes]], found: Results) -> None:
     spots, fans, waves = found.spots, found.fans, found.scene.wavelengths
     count = len(found.fields)
     if not found.lens.afocal:
-        spots = dataclasses.replace(spots, points=found.hits)
+        spots = dataclasses.replace(spots, points=jnp.asarray(found.hits))
     sizes = [*analyses.spot_radius(spots)[:count], *spots.airy_radius[:count]]
     half = 1.1e3 * max((s for s in sizes if np.isfinite(s)), default=1e-3)
     errors = 1e3 * np.stack([fans.tangential[..., 1], fans.sagittal[..., 0]])
@@ -349,7 +349,7 @@ def highest(limit: float, sizes: np.ndarray) -> float:
     return min(limit if limit > 0 else _LINES, _LINES, rounded_up(_FADED / blur, (1, 2, 4, 10)))
 
 
-def _circles(spots: Spots, shown: int) -> tuple[Array, Model, int]:
+def _circles(spots: Spots, shown: int) -> tuple[np.ndarray, Model, int]:
     """Radii (M,), mm, model and cells of the pupil for the encircled energy of `shown` fields. The
     model is "rays" if "waves" would need too many cells for a grid that holds the spots."""
     airy = float(np.min(spots.airy_radius))
