@@ -156,7 +156,7 @@ def _in_chebyshev(degree: int) -> np.ndarray:
     rows[0] /= 2
     with jax.core.eval_context():
         grid = np.stack(np.meshgrid(nodes, nodes, indexing="ij")) * _EDGE
-        values = np.asarray(zernike(jnp.asarray(grid), degree))
+        values = np.asarray(zernike(jnp.asarray(grid, float), degree))
     return np.einsum("pab,ia,jb->pij", values, rows, rows)
 
 

@@ -86,7 +86,7 @@ def output(options: argparse.Namespace, say: Callable[[str], None]) -> Iterator[
     yield f"{lens.name}: {about}"
     yield from (f"  {name:<19}  {value}" for name, value in first)
     say("tracing; another kind of lens is compiled first, for half a minute or less")
-    axial = beam_of(lens, scene.at(jnp.asarray(np.zeros(2))))
+    axial = beam_of(lens, scene.at(jnp.asarray(np.zeros(2), float)))
     beams = [beam_of(lens, point) for point in scene.each()]
     notes = [] if lens.afocal else [*focus_lines(found, middle, axial)]
     notes += [note] if note else []

@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from jax.typing import ArrayLike
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
@@ -204,9 +205,7 @@ def analysed(
     middle = scene.reference(None)
     widest = max(map(abs, angles)) * (1 if max(angles) >= -min(angles) else -1)
     line = np.linspace(0, widest, _CURVE)
-    at = lambda fields: checked_scene(  # noqa: E731
-        lens, scene.at(jnp.asarray(np.stack([0 * (a := np.asarray(fields)), a], axis=-1)))
-    )
+    at = functools.partial(_along_y, lens, scene)
     say("tracing chief rays")
     foci, bent, colour = jax.tree.map(np.asarray, along_field(lens, at(line)))
     say("tracing fans")
@@ -222,7 +221,7 @@ def analysed(
     lines = np.linspace(0, highest(limit, spots.rms[: len(some)]), _FREQUENCIES)
     radii, model, cells = _circles(spots, len(some))
     beams = beams_of(lens, at(wide), beam_rule(_DEGREE, rule.symmetry, rule))
-    asked = scene.wavelengths, scene.spectrum, *map(jnp.asarray, (lines, radii))
+    asked = scene.wavelengths, scene.spectrum, *(jnp.asarray(a, float) for a in (lines, radii))
     waves = _waves(lens, beams, asked, len(some), model, cells)
     third: ThirdOrder | str
     try:
@@ -245,8 +244,13 @@ def shown_fields(lens: Lens, scene: Scene) -> tuple[Scene, list[float]]:
     angles = np.unique(along)
     count = min(len(angles), len(FIELD_COLOURS))
     picked = np.round(np.linspace(0, len(angles) - 1, count)).astype(int)
-    field = np.stack([0 * angles[picked], angles[picked]], axis=-1)
-    return checked_scene(lens, scene.at(jnp.asarray(field))), np.delete(angles, picked).tolist()
+    return _along_y(lens, scene, angles[picked]), np.delete(angles, picked).tolist()
+
+
+def _along_y(lens: Lens, scene: Scene, angles: ArrayLike) -> Scene:
+    """A scene of fields along y, (F,) radians. An array of a named dtype compiles nothing."""
+    along = np.asarray(angles)
+    return checked_scene(lens, scene.at(jnp.asarray(np.stack([0 * along, along], -1), float)))
 
 
 _third_order = jit(third_order, ONCE)
@@ -292,7 +296,7 @@ def _draw_fields(axes: dict[str, list[Axes]], found: Results) -> None:
     spots, fans, waves = found.spots, found.fans, found.scene.wavelengths
     count = len(found.fields)
     if not found.lens.afocal:
-        spots = dataclasses.replace(spots, points=jnp.asarray(found.hits))
+        spots = dataclasses.replace(spots, points=jnp.asarray(found.hits, float))
     sizes = [*analyses.spot_radius(spots)[:count], *spots.airy_radius[:count]]
     half = 1.1e3 * max((s for s in sizes if np.isfinite(s)), default=1e-3)
     errors = 1e3 * np.stack([fans.tangential[..., 1], fans.sagittal[..., 0]])
