@@ -47,16 +47,16 @@ ALLOWED_ALL = {"learn.__init__", *(f"show.{name}" for name in _DRAWN)}
 # Most lines of code of each room; no blank, comment, docstring or import is counted. They
 # fall, and rise only by a new capability, whose commit says by how much: text is free, code is not.
 ROOMS = {
-    "drt_jax": 367,
+    "drt_jax": 368,
     "drt_jax/check": 329,
     "drt_jax/design": 3337,
     "drt_jax/files": 3120,
-    "drt_jax/image": 3018,
+    "drt_jax/image": 3046,
     "drt_jax/learn": 655,
-    "drt_jax/lens": 1881,
+    "drt_jax/lens": 1886,
     "drt_jax/pupil": 776,
-    "drt_jax/rays": 1312,
-    "drt_jax/show": 1437,
+    "drt_jax/rays": 1313,
+    "drt_jax/show": 1426,
     "experiments": 487,
     "experiments/designing": 881,
     "experiments/imaging": 452,
