@@ -12,7 +12,6 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 from jax.sharding import Mesh
-from scipy.stats import qmc
 
 from ..compilation import LARGE, jit
 from ..devices import shared
@@ -60,6 +59,8 @@ def sobol_starts(variables: Variables | SharedVariables, count: int, seed: int =
 
     Returns (count, N).
     """
+    from scipy.stats import qmc  # takes a second to import
+
     low, high = np.asarray(variables.low), np.asarray(variables.high)
     for name, bounds in zip(variables.names, zip(low, high)):
         bounded = np.all(np.isfinite(bounds))

@@ -14,7 +14,6 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 from jax.sharding import Mesh
-from scipy.special import gammainc
 
 from ..compilation import LARGE, ONCE, jit
 from ..devices import shared
@@ -75,6 +74,8 @@ def variances(perturbed: PerturbedLens, normal: bool = False) -> np.ndarray:
     perturbed: the lens and its deviations.
     normal: True for the normal distribution.
     """
+    from scipy.special import gammainc  # takes a quarter of a second to import
+
     count = np.array([KINDS[error.kind].axes for error in perturbed.deviations])
     if not normal:
         return 1 / (count + 2)

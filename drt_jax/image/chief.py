@@ -21,6 +21,7 @@ from typing import Literal, NamedTuple, get_args
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 
 from ..compilation import LARGE, jit
@@ -30,8 +31,10 @@ from ..lens.scene import Scene, checked_scene, over_points
 from ..lens.surface import surface_sag
 from ..numerics import (
     Numbers,
+    concrete,
     einsum,
     known_values,
+    program,
     real_array,
     safe_divide,
     safe_sqrt,
@@ -129,11 +132,36 @@ def lateral_colour(lens: Lens, scene: Scene, reference: int | None = None) -> Ar
     Returns (..., W, 2), mm along x and y of the sensor. ValueError for an index out of range.
     """
     scene = checked_scene(lens, scene)
-    middle = scene.reference(reference)
-    found = _chief_rays(lens, scene)
+    return _lateral(_chief_rays(lens, scene), scene.reference(reference))
+
+
+@functools.partial(program, static_argnames="middle")
+def _lateral(found: _ChiefRays, middle: int) -> Array:
+    """`lateral_colour` from chief rays. middle: index of the reference wavelength."""
     moved = found.hit - found.hit[..., middle, None, :]
     whole = found.whole & found.whole[..., middle, None]
     return jnp.where(whole[..., None], moved, jnp.inf)
+
+
+def along_field(lens: Lens, scene: Scene) -> tuple[FieldCurvature, Distortion, Array]:
+    """`field_curvature`, `distortion` and `lateral_colour` by one trace.
+
+    lens, scene: as there; fields (F, 2) at one distance.
+    """
+    scene = checked_scene(lens, scene)
+    warn_of_focus(lens, scene)
+    line = scene.with_axis()
+    return _along_field(_chief_rays(lens, line), line.field, scene.reference(None), lens.afocal)
+
+
+@functools.partial(program, static_argnames=("middle", "afocal"))
+def _along_field(
+    found: _ChiefRays, fields: Array, middle: int, afocal: bool
+) -> tuple[FieldCurvature, Distortion, Array]:
+    """`along_field` from chief rays of fields (F + 1, 2), the axis first."""
+    bent = _distortion(found, fields, None, "tangent", False, afocal)
+    later = jax.tree.map(lambda a: a[1:], found)
+    return FieldCurvature(later.tangential, later.sagittal), bent, _lateral(later, middle)
 
 
 def distortion(
@@ -161,7 +189,7 @@ def distortion(
     scene, dtype = checked_scene(lens, scene), lens.curvature.dtype
     line = scene.with_axis()
     found, waves = _chief_rays(lens, line), len(scene.wavelengths)
-    scale = found.by_field[0]
+    scale = None
     if focal_length is not None and not isinstance(focal_length, str):
         length = real_array("focal_length", focal_length, dtype)
         if length.shape not in ((), (waves,)):
@@ -175,10 +203,16 @@ def distortion(
 
 @functools.partial(jax.jit, static_argnames=("mapping", "calibrated", "afocal"))
 def _distortion(
-    found: _ChiefRays, fields: Array, scale: Array, mapping: Mapping, calibrated: bool, afocal: bool
+    found: _ChiefRays,
+    fields: Array,
+    scale: Array | None,
+    mapping: Mapping,
+    calibrated: bool,
+    afocal: bool,
 ) -> Distortion:
-    """`distortion` from chief rays of fields (F + 1, 2), the axis first, and scale (W, 2, 2),
-    mm."""
+    """`distortion` from chief rays of fields (F + 1, 2), the axis first, and scale (W, 2, 2), mm;
+    None for that of rays near the axis."""
+    scale = found.by_field[0] if scale is None else scale
     whole = found.whole[1:] & found.whole[:1]
     place = jnp.tan(fields[1:])
     if afocal and mapping == "tangent":  # hits are angles, in mrad: compare their tangents
@@ -216,14 +250,21 @@ def _chief_rays(lens: Lens, scene: Scene) -> _ChiefRays:
     """The chief rays of the points of a scene that fits the lens."""
     if known_values((lens, scene)) is None:
         return _traced(lens, scene, SEARCH)
-    count, shape, far = math.prod(scene.shape), scene.shape, scene.distance
-    far = jnp.broadcast_to(far, shape).reshape(-1) if far.ndim else far
-    line = scene.at(jnp.broadcast_to(scene.field, (*shape, 2)).reshape(-1, 2), far)
+    count, shape, (field, far) = math.prod(scene.shape), scene.shape, scene.flat()
+    line = scene.at(field, far if scene.distance.ndim else scene.distance)
+    far = line.distance
     known = known_rays(lens, line, CHIEF.T.astype(lens.curvature.dtype))
     # Padding lets similar numbers of points share a program.
-    pad = lambda a: jnp.resize(a, (count + -count % _POINTS, *a.shape[1:]))  # noqa: E731
-    padded = line.at(pad(line.field), pad(far) if far.ndim else far)
-    found = _traced(lens, padded, jax.tree.map(pad, known))
+    there, size = np if concrete(line) else jnp, count + -count % _POINTS
+    pad = lambda a, there=np: there.resize(a, (size, *a.shape[1:]))  # noqa: E731
+    padded = line.at(pad(line.field, there), pad(far, there) if far.ndim else far)
+    return _first(_traced(lens, padded, jax.tree.map(pad, known)), shape)
+
+
+@functools.partial(program, static_argnames="shape")
+def _first(found: _ChiefRays, shape: tuple[int, ...]) -> _ChiefRays:
+    """The first chief rays, as many as a scene of a shape has points, with that shape."""
+    count = math.prod(shape)
     return jax.tree.map(lambda a: a[:count].reshape(*shape, *a.shape[1:]), found)
 
 

@@ -17,7 +17,7 @@ from ..inputs import require
 from ..lens.lens import Lens
 from ..lens.paraxial import first_order
 from ..lens.scene import Scene, checked_scene, over_points
-from ..numerics import Numbers, real_array, safe_divide
+from ..numerics import Numbers, program, real_array, safe_divide
 from ..rays.known import Known, known_rays
 from ..rays.status import Status, reaches_sensor
 from ..rays.system import Vector
@@ -74,13 +74,19 @@ def ray_fans(lens: Lens, scene: Scene, count: int = 41, reference: int | None = 
     heights = jnp.linspace(-1, 1, int(count), dtype=lens.curvature.dtype)
     scene = checked_scene(lens, scene)
     warn_of_paths(lens, scene)
-    hit, _, opd, good = _traced(lens, scene, heights)
-    middle = scene.reference(reference)
+    return _fans(heights, *_traced(lens, scene, heights), scene.reference(reference))
+
+
+@functools.partial(program, static_argnames="middle")
+def _fans(
+    heights: Array, hit: Array, slope: Array, opd: Array, good: Array, middle: int
+) -> RayFans:
+    """`RayFans` of what `_traced` returns, for the index of the reference wavelength."""
     moved = hit[..., 1:, :] - hit[..., middle, None, :1, :]
     arrives = good[..., 1:] & good[..., middle, None, :1] & good[..., :1]
     moved = jnp.where(arrives[..., None], moved, jnp.inf)
     path = jnp.where(arrives, opd[..., 1:], jnp.inf)
-    halves = (slice(None, count), slice(count, None))
+    halves = (slice(None, len(heights)), slice(len(heights), None))
     parts = [moved[..., half, :] for half in halves] + [path[..., half] for half in halves]
     return RayFans(heights, *parts)
 
@@ -116,9 +122,15 @@ def _traced(lens: Lens, scene: Scene, heights: Array) -> tuple[Array, Array, Arr
     Returns hits (..., W, 1 + 2 N, 2), mm, slopes of the same shape, path differences
     (..., W, 1 + 2 N), waves, and whether each ray arrives, bool.
     """
-    none, first = jnp.zeros_like(heights), jnp.zeros_like(heights[:1])
-    points = jnp.concatenate([first, none, heights]), jnp.concatenate([first, heights, none])
+    points = _cross(heights)
     return _of_points(lens, scene, points, known_rays(lens, scene, points))
+
+
+@program
+def _cross(heights: Array) -> Vector:
+    """The centre of the stop, then heights on its y axis, then on its x axis."""
+    none, first = jnp.zeros_like(heights), jnp.zeros_like(heights[:1])
+    return jnp.concatenate([first, none, heights]), jnp.concatenate([first, heights, none])
 
 
 @functools.partial(jit, wanted=LARGE)

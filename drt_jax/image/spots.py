@@ -118,7 +118,7 @@ def spot_diagram(
     found = _light(lens, scene, sampling, "object", reference)
     known = known_values((lens, found.rms))
     if known is not None:
-        wrong = hit_rounding(known[0]) / max(float(jnp.min(known[1])), np.finfo(float).tiny)
+        wrong = hit_rounding(known[0]) / max(np.min(np.asarray(known[1])), np.finfo(float).tiny)
         check_dtype(known[0], "spots", wrong, _ROUGH, " of their size")
     return found
 

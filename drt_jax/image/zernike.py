@@ -25,7 +25,7 @@ from ..compilation import LARGE, jit
 from ..lens.forms import fringe_terms, noll_terms
 from ..lens.lens import Lens
 from ..lens.scene import Scene, checked_scene, over_points
-from ..numerics import einsum, matmul
+from ..numerics import einsum, matmul, program
 from ..pupil.patterns import disc
 from ..rays.known import Known, known_rays
 from ..rays.status import Status, reaches_sensor
@@ -41,6 +41,7 @@ _ORDER, _AZIMUTHS = 13, 26
 _MOST = 91
 
 
+@functools.partial(program, static_argnames="degree")
 def zernike(points: Array, degree: int) -> Array:
     """Zernike polynomials up to a degree, in Noll's order.
 
@@ -153,9 +154,9 @@ def _in_chebyshev(degree: int) -> np.ndarray:
     nodes = np.cos(np.pi * (np.arange(degree + 1) + 0.5) / (degree + 1))
     rows = np.polynomial.chebyshev.chebvander(nodes, degree).T * 2 / (degree + 1)
     rows[0] /= 2
-    with jax.ensure_compile_time_eval():
+    with jax.core.eval_context():
         grid = np.stack(np.meshgrid(nodes, nodes, indexing="ij")) * _EDGE
-        values = np.asarray(zernike(jnp.asarray(grid), degree))
+        values = np.asarray(zernike(jnp.asarray(grid, float), degree))
     return np.einsum("pab,ia,jb->pij", values, rows, rows)
 
 

@@ -126,8 +126,8 @@ def toroid(w: Point, shape: Shape) -> tuple[Array, Array]:
 
 def powers_xy(count: int) -> list[tuple[int, int]]:
     """Powers (i, j) of x^i y^j of the first `count` coefficients: x, y, x^2, x y, y^2, ..."""
-    pairs = [(degree - j, j) for degree in range(1, count + 1) for j in range(degree + 1)]
-    return pairs[:count]
+    pairs = ((degree - j, j) for degree in itertools.count(1) for j in range(degree + 1))
+    return [*itertools.islice(pairs, count)]
 
 
 def _polynomial(w: Point, terms: dict[tuple[int, int], Array]) -> Array:

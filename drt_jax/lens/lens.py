@@ -302,7 +302,8 @@ class Lens:
         wavelengths: one or a list, um. ValueError for none, for another shape, and as in
             `check_wavelengths`.
         """
-        found = jnp.atleast_1d(real_array("wavelengths", wavelengths, self.curvature.dtype))
+        found = real_array("wavelengths", wavelengths, self.curvature.dtype)
+        found = found if found.ndim else found[None]
         is_list = found.ndim == 1 and found.size
         require(is_list, f"wavelengths: expected one or a list, got shape {found.shape}")
         self.check_wavelengths(wavelengths)

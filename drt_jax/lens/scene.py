@@ -167,15 +167,15 @@ class Scene:
 
     def each(self) -> "list[Scene]":
         """The points, one by one; of known numbers as NumPy arrays."""
-        flat = self.flat()
-        fields, far = jax.tree.map(np.asarray, flat) if concrete(flat) else flat
+        fields, far = self.flat()
         return [self.at(fields[k], far[k]) for k in range(len(far))]
 
     def flat(self) -> tuple[Array, Array]:
-        """Field (P, 2) and distance (P,) of all points."""
+        """Field (P, 2) and distance (P,) of all points; of known numbers as NumPy arrays."""
+        there = np if concrete((self.field, self.distance)) else jnp
         return (
-            jnp.broadcast_to(self.field, (*self.shape, 2)).reshape(-1, 2),
-            jnp.broadcast_to(self.distance, self.shape).reshape(-1),
+            there.broadcast_to(self.field, (*self.shape, 2)).reshape(-1, 2),
+            there.broadcast_to(self.distance, self.shape).reshape(-1),
         )
 
     @property
@@ -231,7 +231,7 @@ def checked_scene(lens: Lens, scene: Scene) -> Scene:
         numbers = getattr(scene, what)
         with jax.core.eval_context() if concrete(numbers) else contextlib.nullcontext():
             found = real_array(what, numbers, dtype)
-            return jnp.atleast_1d(found) if what.startswith("wavelength") else found
+            return found if found.ndim or not what.startswith("wavelength") else found[None]
 
     lens.checked_wavelengths(scene.wavelengths)  # ValueError
     waves = array("wavelengths")

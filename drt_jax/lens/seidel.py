@@ -12,7 +12,7 @@ from jax import Array
 
 from ..inputs import require
 from ..numerics import known_values, safe_divide
-from .forms import FORMS
+from .forms import FORMS, Point, Shape
 from .lens import Lens
 from .paraxial import (
     ParaxialRay,
@@ -24,7 +24,7 @@ from .paraxial import (
     trace_ray,
 )
 from .scene import Scene, checked_scene, over_points
-from .surface import by_form, surface_sag
+from .surface import by_form, profile, surface_sag
 
 
 class ThirdOrder(NamedTuple):
@@ -64,15 +64,21 @@ def _fourth_order(lens: Lens, vertex: Array) -> Array:
     mm^-3.
     """
 
-    def height(y):
-        return by_form(surface_sag, (y,), lens.shape, lens.forms)
+    def quartic(y: Point, shape: Shape, form: str) -> Array:
+        """The coefficient: for an asphere half the second derivative by r^2, which costs less to
+        trace, else a 24th of the fourth by r."""
+        if form == "asphere":
+            return profile(y, shape)[2] / 2
+        height = lambda y: surface_sag((y,), shape, form)  # noqa: E731
+        for _ in range(4):
+            height = slope_of(height)
+        return height(y[0]) / 24
 
     def slope_of(f):
         return lambda y: jax.jvp(f, (y,), (jnp.ones_like(y),))[1]
 
-    for _ in range(4):
-        height = slope_of(height)
-    return height(jnp.zeros_like(lens.curvature))[:-1] / 24 - vertex**3 / 8
+    axis = (jnp.zeros_like(lens.curvature),)
+    return by_form(quartic, axis, lens.shape, lens.forms)[:-1] - vertex**3 / 8
 
 
 def _seidel(

@@ -59,7 +59,7 @@ def sag_slope(w: Point, shape: Shape, form: str = "asphere") -> tuple[Array, tup
     """
     w = tuple(w)
     if form == "asphere":
-        z, first, _ = _profile(w, shape)
+        z, first, _ = profile(w, shape)
         return z, tuple(2 * a * first for a in w)
     z, pull_back = jax.vjp(lambda w: surface_sag(w, shape, form), w)
     return z, pull_back(jnp.ones_like(z))[0]
@@ -77,7 +77,7 @@ def sag_derivatives(
     """
     w = tuple(w)
     if form == "asphere":
-        z, first, second = _profile(w, shape)
+        z, first, second = profile(w, shape)
         bend = tuple(
             tuple(4 * a * b * second + (2 * first if i == j else 0) for j, b in enumerate(w))
             for i, a in enumerate(w)
@@ -91,7 +91,7 @@ def sag_derivatives(
     return z, slope, tuple(rows)
 
 
-def _profile(w: tuple[Array, ...], shape: Shape) -> tuple[Array, Array, Array]:
+def profile(w: Point, shape: Shape) -> tuple[Array, Array, Array]:
     """Sag of an asphere and its first and second derivatives by r^2.
 
     Beyond the rim, it continues with the slope at the rim.

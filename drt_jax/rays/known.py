@@ -93,8 +93,9 @@ def _found(lens: Lens, scene: Scene, points: Vector) -> Found | None:
 
 def wide(scene: Scene, points: Any) -> np.ndarray:
     """Stop points, D arrays (Q,) or (W, Q), as an array (D, W, Q)."""
-    shape = scene.wavelengths.size, np.shape(points[0])[-1]
-    return np.stack([np.broadcast_to(p, shape) for p in jax.tree.map(np.asarray, points)])
+    known = jax.tree.map(np.asarray, points)
+    shape = scene.wavelengths.size, known[0].shape[-1]
+    return np.stack([np.broadcast_to(p, shape) for p in known])
 
 
 def tiles(stop: np.ndarray) -> list[np.ndarray]:

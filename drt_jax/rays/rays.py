@@ -57,11 +57,11 @@ def trace_rays(lens: Lens, scene: Scene, pupil: Numbers) -> Rays:
     """
     scene, points = checked_scene(lens, scene), stop_points(lens, pupil)
     count, size = len(points), _padded(len(points))
+    library = np if concrete(points) else jnp
     if count == size or known_values((lens, scene, points)) is None:
-        return _trace(lens, scene, points, known_rays(lens, scene, points.T))
+        return _trace(lens, scene, points, known_rays(lens, scene, library.asarray(points).T))
     # Bundles of similar size are padded to one size, so that they share a compiled program. The
     # stop points of the padding are inf; such rays are MISSED without a search.
-    library = np if concrete(points) else jnp
     filled = library.pad(points, ((0, size - count), (0, 0)), constant_values=np.inf)
     return _first(_trace(lens, scene, filled, known_rays(lens, scene, filled.T)), count)
 

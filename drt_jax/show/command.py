@@ -86,7 +86,7 @@ def output(options: argparse.Namespace, say: Callable[[str], None]) -> Iterator[
     yield f"{lens.name}: {about}"
     yield from (f"  {name:<19}  {value}" for name, value in first)
     say("tracing; another kind of lens is compiled first, for half a minute or less")
-    axial = beam_of(lens, Scene.point(0.0, distance, middle))
+    axial = beam_of(lens, scene.at(jnp.asarray(np.zeros(2), float)))
     beams = [beam_of(lens, point) for point in scene.each()]
     notes = [] if lens.afocal else [*focus_lines(found, middle, axial)]
     notes += [note] if note else []
@@ -225,20 +225,21 @@ def field_rows(
     for field, point, beam in zip(fields, scene.each(), beams):
         try:
             rules = (_rule(lens, order, symmetry, whole) for order in _ORDERS)
-            rough, found = (psf_moments(lens, point, rule) for rule in rules)
+            each = (psf_moments(lens, point, rule) for rule in rules)
+            rough, found = jax.tree.map(np.asarray, (*each,))
         except ValueError as error:  # no light arrives in one of the wavelengths
             yield f"{field:.4g}", f"! {error}"
             continue
         light = 100 * float(found.throughput[middle])
         cut = "; ".join(filter(None, (", ".join(map(str, beam.clipping)), *beam.ends))) or "none"
-        squares = [np.trace(np.asarray(m.covariance), axis1=1, axis2=2) for m in (found, rough)]
+        squares = [np.trace(m.covariance, axis1=1, axis2=2) for m in (found, rough)]
         sizes = [f"{1e3 * s:.4g}" if s > _NO_SIZE else "<1e-6" for s in np.sqrt(squares[0])]
         height = round(float(found.mean[middle, 1]), 9) + 0.0  # no -0
         yield f"{field:.4g}", f"{height:.5g}", *sizes, f"{light:.2f}", cut
         change = np.max(np.abs(squares[1] - squares[0]) / np.maximum(squares[0], _NO_SIZE**2)) / 2
         if change > _TOLERANCE:
             yield f"  ! these spots are known to {change:.1g} of their size only"
-        for wavelength, part in zip(wavelengths, 100 * np.asarray(found.throughput)):
+        for wavelength, part in zip(wavelengths, 100 * found.throughput):
             if f"{part:.2f}" != f"{light:.2f}":
                 yield f"  ! at {wavelength:.4g} um {part:.2f} % of the light arrives"
         if ENDS[Status.CROSSED] in beam.ends:

@@ -2,7 +2,6 @@
 clipping of the beam of a field by the apertures.
 """
 
-import dataclasses
 import functools
 import itertools
 import math
@@ -12,22 +11,22 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.typing import ArrayLike
 from matplotlib.axes import Axes
 
 from ..compilation import ONCE, jit
 from ..lens.aperture import depths
 from ..lens.clearance import clearance, clipping_surface
-from ..lens.lens import Lens, sag
+from ..lens.lens import Lens
 from ..lens.scene import Scene, checked_scene
-from ..numerics import einsum
+from ..lens.surface import by_form, surface_sag
+from ..numerics import einsum, program
 from ..pupil.patterns import hexapolar
-from ..rays.rays import trace_rays
+from ..rays.rays import Rays, trace_rays
 from ..rays.status import Status
 from .figures import FIELD_COLOURS, scale_bar
 
 _POINTS = 161
-_RAYS = 600  # rays per trace, so that all traces share one compiled program
+_RAYS = 640  # rays per trace, so that all traces share one compiled program
 _RINGS, _RIM = 10, 240  # rings of rays that fill the stop, and number of rays on its rim
 _SCANS = 3  # scans of the meridian for the edges of a beam; each refines the last one
 _ON_RIM = 1e-6  # mm: a ray that misses an aperture by less only grazes it
@@ -73,8 +72,7 @@ def draw(lens: Lens, scene: Scene | None = None, rays: int = 7) -> Drawing:
     rays: number of rays for each point; rays that do not exist are left out.
     """
     scene = checked_scene(lens, Scene.point() if scene is None else scene)
-    middle = slice(scene.reference(None), scene.reference(None) + 1)
-    points = _in_colour(scene, scene.wavelengths[middle]).each()
+    points, places = scene.each(), jax.tree.map(np.asarray, _places(lens))
     angles = [float(point.field[1]) for point in points]
     # A surface that does not bend light is neither a corner of a ray nor a face of glass.
     corners = [*lens.active, lens.count]
@@ -88,7 +86,7 @@ def draw(lens: Lens, scene: Scene | None = None, rays: int = 7) -> Drawing:
             ends.append((ray[cut, :0:-1], angle, float(point.distance)))
     drawn = np.concatenate([np.zeros((1, 2)), *(hit.reshape(-1, 2) for hit in hits)])
     reach = float(np.max(np.abs(drawn[:, 1]))) or 1.0
-    z = np.concatenate([drawn[:, 0], np.asarray(lens.places[0])])
+    z = np.concatenate([drawn[:, 0], places[0]])
     start = np.min(z) - 0.15 * np.ptp(z)
     paths = [
         [_path(ray, start, angle, float(point.distance)) for ray in hit]
@@ -97,8 +95,9 @@ def draw(lens: Lens, scene: Scene | None = None, rays: int = 7) -> Drawing:
     vignetted = [_path(ray, start, *place) for ray, *place in ends]
     extents = _extents(lens, 1.1 * _widths(lens, hits, reach))
     profiles = np.linspace(*extents, _POINTS, axis=-1)
-    faces = [_placed(lens, i, y, sag(lens, i, 0.0, y)) for i, y in enumerate(profiles)]
-    glass = [_outline(lens, pair, profiles, faces) for pair in _pieces(lens)]
+    sags = np.asarray(_sags(lens, profiles))
+    faces = [_placed(places, i, y, sag) for i, (y, sag) in enumerate(zip(profiles, sags))]
+    glass = [_outline(places, pair, profiles, sags, faces) for pair in _pieces(lens)]
     pierced = _pierced(lens, profiles)
     mirrors = [
         np.where(pierced[i, :, None], np.nan, faces[i]) for i in np.flatnonzero(lens.mirrors)
@@ -107,10 +106,10 @@ def draw(lens: Lens, scene: Scene | None = None, rays: int = 7) -> Drawing:
     outwards = (high - low) / np.linalg.norm(high - low) * 0.15 * reach
     blades = [np.stack([low, low - outwards]), np.stack([high, high + outwards])]
     # The face of the sensor about its centre, as wide as the rays that meet it.
-    centre = _placed(lens, lens.count, np.zeros(1), np.zeros(1))
+    centre = _placed(places, lens.count, np.zeros(1), np.zeros(1))
     away = [float(np.linalg.norm(path[-1] - centre)) for fan in paths for path in fan]
     wide = max(1.1 * max(away, default=0.0), 0.3 * reach)
-    sensor = _placed(lens, lens.count, np.array([-wide, wide]), np.zeros(2))
+    sensor = _placed(places, lens.count, np.array([-wide, wide]), np.zeros(2))
     tops = {i: faces[i][-1, 1] for i in lens.active}
     for pair, outline in zip(_pieces(lens), glass):
         tops |= {i: max(tops[i], np.max(outline[:, 1])) for i in pair}
@@ -118,38 +117,47 @@ def draw(lens: Lens, scene: Scene | None = None, rays: int = 7) -> Drawing:
     return Drawing(glass, mirrors, blades, sensor, paths, vignetted, angles, numbers)
 
 
+@program
+def _places(lens: Lens) -> tuple[jax.Array, jax.Array | None, jax.Array | None]:
+    """`Lens.places`, compiled."""
+    return lens.places
+
+
+@program
+def _sags(lens: Lens, profiles: jax.Array) -> jax.Array:
+    """Sags (S, N) at the heights `profiles` (S, N), mm."""
+    shape = jax.tree.map(lambda a: a[..., :-1, None], lens.shape)
+    return by_form(surface_sag, (0 * profiles, profiles), shape, lens.forms[:-1])
+
+
 def _outline(
-    lens: Lens, pair: tuple[int, int], profiles: np.ndarray, faces: list[np.ndarray]
+    places: tuple,
+    pair: tuple[int, int],
+    profiles: np.ndarray,
+    sags: np.ndarray,
+    faces: list[np.ndarray],
 ) -> np.ndarray:
     """The closed outline of a piece of glass with one rim, as it is made: the narrower face is
     continued by a plane; or, where the faces would then cross, with the rims of its own faces.
 
-    profiles: (S, N), mm, heights of the points of the faces.
+    places: as in `_placed`.
+    profiles, sags: (S, N), mm, heights of the points of the faces, and the sags there.
     """
     low, high = profiles[list(pair), 0].min(), profiles[list(pair), -1].max()
     wide = [np.concatenate([low[None], profiles[i], high[None]]) for i in pair]
-    made = [
-        _placed(lens, i, y, sag(lens, i, 0.0, np.clip(y, *profiles[i][[0, -1]])))
-        for i, y in zip(pair, wide)
-    ]
+    made = [_placed(places, i, y, np.pad(sags[i], 1, "edge")) for i, y in zip(pair, wide)]
     gaps = [made[1][end, 0] - made[0][end, 0] for end in (0, -1)]
     inside = faces[pair[1]][_POINTS // 2, 0] - faces[pair[0]][_POINTS // 2, 0]
     front, back = made if np.all(np.array(gaps) * inside > 0) else (faces[i] for i in pair)
     return np.concatenate([front, back[::-1], front[:1]])
 
 
-def _in_colour(scene: Scene, wavelengths: ArrayLike) -> Scene:
-    """A scene in one wavelength, (1,) um."""
-    one = jnp.asarray(wavelengths)
-    return dataclasses.replace(scene, wavelengths=one, wavelength_weights=None)
-
-
 class _Traced(NamedTuple):
-    """Q rays of one wavelength.
+    """Q rays of W wavelengths.
 
-    points: (Q, S + 1, 3), mm along the axes of the lens. hits: (Q, S + 1, 2), x and y from the
-    vertices, along the axes of the surfaces. directions: (Q, 3), at the sensor, along its axes.
-    status: (Q,). clips: (Q,), the first surface whose aperture stops a clipped ray.
+    points: (W, Q, S + 1, 3), mm along the axes of the lens. hits: (W, Q, S + 1, 2), x and y from
+    the vertices, along the axes of the surfaces. directions: (W, Q, 3), at the sensor, along its
+    axes. status: (W, Q). clips: (W, Q), the first surface whose aperture stops a clipped ray.
     """
 
     points: np.ndarray
@@ -160,36 +168,33 @@ class _Traced(NamedTuple):
 
 
 @functools.partial(jit, wanted=ONCE)
-def _in_own_axes(lens: Lens, points: jax.Array, directions: jax.Array) -> tuple[jax.Array, ...]:
-    """Hits, directions and clips of `_Traced`, of points and directions along the axes of the
-    lens."""
+def _in_own_axes(lens: Lens, rays: Rays) -> tuple[jax.Array, ...]:
+    """The parts of `_Traced`."""
     vertex, across, turned = lens.places
     across = jnp.zeros((len(vertex), 2), vertex.dtype) if across is None else across
-    own = points - jnp.concatenate([across, vertex[:, None]], axis=1)[None]
+    own = rays.points - jnp.concatenate([across, vertex[:, None]], axis=1)[None, None]
+    directions = rays.directions[:, :, -1]
     if turned is not None:
-        own = einsum("qsi,sij->qsj", own, turned)
+        own = einsum("wqsi,sij->wqsj", own, turned)
         directions = directions @ turned[-1]
-    hits = own[..., :2]
-    clips = clipping_surface(lens, (hits[..., 0].T, hits[..., 1].T))
-    return hits, directions, clips
+    clips = clipping_surface(lens, tuple(jnp.moveaxis(own, (3, 2), (0, 1))[:2]))
+    return rays.points, own[..., :2], directions, rays.status, clips
 
 
 def _traced(lens: Lens, scene: Scene, pupil: np.ndarray) -> _Traced:
-    """Rays of one wavelength through points (Q, 2) of the stop, in units of its radius."""
+    """Rays through points (Q, 2) of the stop, in units of its radius."""
     filled = np.resize(pupil, (-(-len(pupil) // _RAYS) * _RAYS, 2))
-    rays = trace_rays(lens, scene, jnp.asarray(filled, lens.curvature.dtype))
-    points = rays.points[0]
-    hits, directions, clips = _in_own_axes(lens, points, rays.directions[0, :, -1])
-    found = points, hits, directions, rays.status[0], clips
-    return _Traced(*(np.asarray(a)[: len(pupil)] for a in found))
+    found = _in_own_axes(lens, trace_rays(lens, scene, filled))
+    return _Traced(*(np.asarray(a)[:, : len(pupil)] for a in found))
 
 
 def _fan(lens: Lens, scene: Scene, rays: int) -> _Traced:
-    """An even fan of meridional rays, then the rays at the edges of the light that passes, where
-    the rim of the stop is not the edge."""
+    """An even fan of meridional rays in the middle wavelength, (Q, ...), then the rays at the
+    edges of the light that passes, where the rim of the stop is not the edge."""
 
     def traced(heights):
-        return _traced(lens, scene, np.stack([0 * heights, heights], axis=-1))
+        found = _traced(lens, scene, np.stack([0 * heights, heights], axis=-1))
+        return jax.tree.map(lambda a: a[scene.reference(None)], found)
 
     fan, heights = traced(np.linspace(-1.0, 1.0, rays)), np.linspace(-1.0, 1.0, _RAYS)
     for _ in range(_SCANS):
@@ -230,31 +235,21 @@ class Beam(NamedTuple):
 
 
 def beam_of(lens: Lens, scene: Scene) -> Beam:
-    """The beam of one object point in the middle wavelength. What clips and fails is that of all
-    wavelengths."""
+    """The beam of one object point, its spot in the middle wavelength. What clips and fails is that
+    of all wavelengths."""
     scene, middle = checked_scene(lens, scene), scene.reference(None)
-    if len(scene.wavelengths) > 1:
-        waves = jnp.roll(scene.wavelengths, -middle)[:, None]
-        own, *more = (beam_of(lens, _in_colour(scene, w)) for w in waves)
-        for each in more:
-            own = own._replace(
-                clipping=sorted({*own.clipping, *each.clipping}),
-                ends=[words for words in ENDS.values() if words in (*own.ends, *each.ends)],
-                obscured=own.obscured and each.obscured,
-                wide=np.maximum(own.wide, each.wide),
-            )
-        return own
     rim = np.linspace(0, 2 * np.pi, _RIM)
     pupil = np.concatenate([hexapolar(_RINGS)[0], np.stack([np.sin(rim), np.cos(rim)], axis=-1)])
     _, hits, directions, status, clips = _traced(lens, scene, pupil)
-    clipping = np.unique(clips[status == Status.CLIPPED]).tolist()
+    arrives, clipped = status == Status.OK, status == Status.CLIPPED
+    clipping = np.unique(clips[clipped]).tolist()
     ends = [words for end, words in ENDS.items() if np.any(status == end)]
-    obscured = _obscured(lens, hits[status == Status.CLIPPED])
-    wide = np.max(np.linalg.norm(hits[status == Status.OK], axis=-1), axis=0, initial=0.0)
-    inside = (status == Status.OK) & (np.arange(len(pupil)) < len(pupil) - _RIM)
+    obscured = _obscured(lens, hits[clipped])
+    wide = np.max(np.linalg.norm(hits[arrives], axis=-1), axis=0, initial=0.0)
+    inside = arrives[middle] & (np.arange(len(pupil)) < len(pupil) - _RIM)
     if not np.any(inside):
         return Beam(clipping, ends, obscured, wide, math.nan, math.nan, math.nan)
-    hits, slopes = hits[inside, -1], directions[inside]
+    hits, slopes = hits[middle, inside, -1], directions[middle, inside]
     hits, slopes = (a - a.mean(axis=0) for a in (hits, slopes[:, :2] / slopes[:, 2:]))
     size, growth = np.mean(np.sum(hits**2, axis=1)), np.mean(np.sum(slopes**2, axis=1))
     shift = -np.mean(np.sum(hits * slopes, axis=1)) / growth if growth > 0 else 0.0
@@ -262,23 +257,12 @@ def beam_of(lens: Lens, scene: Scene) -> Beam:
     return Beam(clipping, ends, obscured, wide, math.sqrt(size), best, float(shift))
 
 
-def even_hits(lens: Lens, scene: Scene) -> np.ndarray:
-    """Hits (W, Q, 2) on the sensor, mm, of rays evenly over the stop from one object point, so that
-    their density is that of the light; inf for a ray that does not arrive."""
-    scene = checked_scene(lens, scene)
-    waves = np.asarray(scene.wavelengths)[:, None]
-    colours = [_in_colour(scene, jnp.asarray(wave)) for wave in waves]
-    return np.stack([beam_hits(lens, colour)[:, -1] for colour in colours])
-
-
 def beam_hits(lens: Lens, scene: Scene) -> np.ndarray:
-    """Hits (Q, S + 1, 2) on all surfaces and the sensor, mm from their vertices, of rays evenly
-    over the stop from one object point, in the middle wavelength; inf for those that do not arrive.
-    """
-    scene, middle = checked_scene(lens, scene), scene.reference(None)
-    wave = scene.wavelengths[middle : middle + 1]
-    found = _traced(lens, _in_colour(scene, wave), hexapolar(_RINGS)[0])
-    return np.where((found.status == Status.OK)[:, None, None], found.hits, np.inf)
+    """Hits (W, Q, S + 1, 2) on all surfaces and the sensor, mm from their vertices, of rays evenly
+    over the stop from one object point, so that their density is that of the light; inf for those
+    that do not arrive."""
+    found = _traced(lens, checked_scene(lens, scene), hexapolar(_RINGS)[0])
+    return np.where((found.status == Status.OK)[..., None, None], found.hits, np.inf)
 
 
 def _obscured(lens: Lens, hits: np.ndarray) -> bool:
@@ -300,9 +284,8 @@ def _pieces(lens: Lens) -> list[tuple[int, int]]:
 def _widths(lens: Lens, hits: list[np.ndarray], reach: float) -> np.ndarray:
     """Largest ray heights (S,), mm; both faces of a piece of glass get the larger one. `reach` if
     surfaces are decentred or tilted, or where no ray arrives."""
-    wide = np.full(lens.count, reach)
-    _, across, turned = lens.places
-    if across is not None or turned is not None or not sum(map(len, hits)):
+    wide, moved = np.full(lens.count, reach), (lens.decentre, lens.tilt, lens.elements)
+    if jax.tree.leaves(moved) or not sum(map(len, hits)):
         return wide
     wide[list(lens.active)] = np.max(np.abs(np.concatenate(hits)[:, :-1, 1]), axis=0)
     pieces = _pieces(lens)
@@ -370,9 +353,10 @@ def lens_drawing(axes: Axes, drawing: Drawing, half: bool = False) -> Axes:
     return scale_bar(axes, "mm")
 
 
-def _placed(lens: Lens, i: int, y: np.ndarray, z: ArrayLike) -> np.ndarray:
-    """(z, y), along the axes of the lens, of points on surface i (or the sensor)."""
-    vertex, across, turned = jax.tree.map(lambda a: np.asarray(a[i]), lens.places)
+def _placed(places: tuple, i: int, y: np.ndarray, z: np.ndarray) -> np.ndarray:
+    """(z, y), along the axes of the lens, of points on surface i (or the sensor). places:
+    `Lens.places` as NumPy arrays."""
+    vertex, across, turned = jax.tree.map(lambda a: a[i], places)
     points = np.stack([np.zeros_like(y), y, z], axis=-1)
     if turned is not None:
         points = points @ turned.T

@@ -128,7 +128,8 @@ def _grid(lens: Lens, scene: Scene) -> Iterator[tuple[str, Figure]]:
 
 def _footprints(lens: Lens, scene: Scene) -> Iterator[tuple[str, Figure]]:
     """Rays of all fields on each surface that bends light, and on the stop."""
-    hits = np.stack([beam_hits(lens, point) for point in scene.each()])
+    middle = scene.reference(None)
+    hits = np.stack([beam_hits(lens, point)[middle] for point in scene.each()])
     rows = sorted({*lens.active, lens.stop})
     columns = min(len(rows), 6)
     figure, axes = new(-(-len(rows) // columns), columns, 2.0, 2.2)

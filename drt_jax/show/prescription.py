@@ -27,7 +27,8 @@ def first_rows(lens: Lens, found: FirstOrder, wavelength: float) -> Iterator[tup
     ):
         place = f"at {image_of.position + 0.0:.5g} mm from the {end} vertex"
         yield name, f"diameter {2 * image_of.semi_diameter:.5g} mm, {place}"
-    yield "stop", f"surface {lens.stop}, diameter {2 * float(lens.semi_diameter[lens.stop]):.5g} mm"
+    size = 2 * np.asarray(lens.semi_diameter)[lens.stop]
+    yield "stop", f"surface {lens.stop}, diameter {size:.5g} mm"
     yield "sensor", f"{float(lens.sensor):.6g} mm from the first vertex (total track)"
     if lens.afocal:
         far = float(found.image_distance) - float(lens.vertices[-2])

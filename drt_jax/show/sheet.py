@@ -10,19 +10,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from jax.typing import ArrayLike
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from ..compilation import ONCE, jit
 from ..image.beam import Beam, beam_rule
-from ..image.chief import (
-    Distortion,
-    FieldCurvature,
-    distortion,
-    field_curvature,
-    lateral_colour,
-)
+from ..image.chief import Distortion, FieldCurvature, along_field
 from ..image.encircled import encircled
 from ..image.fans import RayFans, ray_fans
 from ..image.refined import beams_of
@@ -34,7 +29,7 @@ from ..lens.seidel import ThirdOrder, third_order
 from ..pupil.rules import PupilRule
 from . import analyses
 from .figures import FIELD_COLOURS, new, rounded_up, scale_bar
-from .layout import draw, even_hits, lens_drawing
+from .layout import beam_hits, draw, lens_drawing
 
 # Points of a curve over the field, points of a fan, frequencies, radii.
 _CURVE, _FAN, _FREQUENCIES, _RADII = 61, 65, 32, 61
@@ -89,23 +84,23 @@ class Results(NamedTuple):
     line: np.ndarray
     foci: FieldCurvature
     bent: Distortion
-    colour: Array
+    colour: np.ndarray
     fans: RayFans
     spots: Spots
     hits: np.ndarray
     lines: np.ndarray
-    contrast: Array
-    limit: Array
-    over_field: Array
-    radii: Array
-    energy: Array
+    contrast: np.ndarray
+    limit: np.ndarray
+    over_field: np.ndarray
+    radii: np.ndarray
+    energy: np.ndarray
     model: Model
     third: ThirdOrder | str
 
     @property
     def fields(self) -> np.ndarray:
         """The angles of the fields that are shown, (F,), radians."""
-        return np.asarray(self.scene.field[:, 1])
+        return np.asarray(self.scene.field)[:, 1]
 
     @property
     def names(self) -> list[str]:
@@ -205,38 +200,36 @@ def analysed(
     """The numbers of a sheet, from the arguments of `sheet`."""
     scene = checked_scene(lens, Scene.point() if scene is None else scene)
     shown, left_out = shown_fields(lens, scene)
-    some = np.asarray(shown.field[:, 1])
+    some = np.asarray(shown.field)[:, 1]
     angles = [*some.tolist(), *left_out]
     middle = scene.reference(None)
     widest = max(map(abs, angles)) * (1 if max(angles) >= -min(angles) else -1)
     line = np.linspace(0, widest, _CURVE)
-    at = lambda fields: checked_scene(  # noqa: E731
-        lens, scene.at(jnp.stack([0 * (a := jnp.asarray(fields)), a], axis=-1))
-    )
+    at = functools.partial(_along_y, lens, scene)
     say("tracing chief rays")
-    foci, bent = field_curvature(lens, at(line)), distortion(lens, at(line))
-    colour = lateral_colour(lens, at(line))
+    foci, bent, colour = jax.tree.map(np.asarray, along_field(lens, at(line)))
     say("tracing fans")
-    fans = ray_fans(lens, shown, _FAN)
+    fans = jax.tree.map(np.asarray, ray_fans(lens, shown, _FAN))
     say("tracing spots")
     wide = np.array([*some, *line[::_STEP]])
     rule = rule_for(lens, at(wide), sampling, _ORDER)
     spots = jax.tree.map(np.asarray, spot_diagram(lens, at(wide), rule))
-    hits = np.stack([even_hits(lens, point) for point in shown.each()])
+    hits = np.stack([beam_hits(lens, point)[:, :, -1] for point in shown.each()])
     say("tracing waves")
     cone = spots.solid_angle[len(some), middle]
-    limit = 2e3 * np.sqrt(cone / np.pi) / float(scene.wavelengths[middle])
+    limit = 2e3 * np.sqrt(cone / np.pi) / float(np.asarray(scene.wavelengths)[middle])
     lines = np.linspace(0, highest(limit, spots.rms[: len(some)]), _FREQUENCIES)
     radii, model, cells = _circles(spots, len(some))
     beams = beams_of(lens, at(wide), beam_rule(_DEGREE, rule.symmetry, rule))
-    asked = scene.wavelengths, scene.spectrum, jnp.asarray(lines), radii
-    contrast, best, over, energy = _waves(lens, beams, asked, len(some), model, cells)
+    asked = scene.wavelengths, scene.spectrum, *(jnp.asarray(a, float) for a in (lines, radii))
+    waves = _waves(lens, beams, asked, len(some), model, cells)
     third: ThirdOrder | str
     try:
-        third = jax.tree.map(lambda a: np.asarray(a[0]), _third_order(lens, at([widest])))
+        third = jax.tree.map(lambda a: np.asarray(a)[0], _third_order(lens, at(np.array([widest]))))
     except ValueError as error:  # no theory for such a lens
         third = str(error)
     traced = shown, left_out, line, foci, bent, colour, fans, spots, hits
+    contrast, best, over, energy = map(np.asarray, waves)
     curves = lines, contrast, best, over, radii, energy, model
     return Results(lens, *traced, *curves, third)
 
@@ -245,13 +238,19 @@ def shown_fields(lens: Lens, scene: Scene) -> tuple[Scene, list[float]]:
     """A scene of the fields that are shown, one for each colour at most and each once, in rising
     order, and the angles of the others, radians. ValueError unless fields lie along y at one
     distance."""
-    if scene.distance.ndim or bool(jnp.any(scene.field[..., 0] != 0)):
+    across, along = np.moveaxis(np.asarray(scene.field), -1, 0)
+    if scene.distance.ndim or np.any(across):
         raise ValueError("scene: a sheet has fields along y, at one distance")
-    angles = np.unique(np.asarray(scene.field[..., 1]))
+    angles = np.unique(along)
     count = min(len(angles), len(FIELD_COLOURS))
     picked = np.round(np.linspace(0, len(angles) - 1, count)).astype(int)
-    field = np.stack([0 * angles[picked], angles[picked]], axis=-1)
-    return checked_scene(lens, scene.at(jnp.asarray(field))), np.delete(angles, picked).tolist()
+    return _along_y(lens, scene, angles[picked]), np.delete(angles, picked).tolist()
+
+
+def _along_y(lens: Lens, scene: Scene, angles: ArrayLike) -> Scene:
+    """A scene of fields along y, (F,) radians. An array of a named dtype compiles nothing."""
+    along = np.asarray(angles)
+    return checked_scene(lens, scene.at(jnp.asarray(np.stack([0 * along, along], -1), float)))
 
 
 _third_order = jit(third_order, ONCE)
@@ -297,7 +296,7 @@ def _draw_fields(axes: dict[str, list[Axes]], found: Results) -> None:
     spots, fans, waves = found.spots, found.fans, found.scene.wavelengths
     count = len(found.fields)
     if not found.lens.afocal:
-        spots = dataclasses.replace(spots, points=jnp.asarray(found.hits))
+        spots = dataclasses.replace(spots, points=jnp.asarray(found.hits, float))
     sizes = [*analyses.spot_radius(spots)[:count], *spots.airy_radius[:count]]
     half = 1.1e3 * max((s for s in sizes if np.isfinite(s)), default=1e-3)
     errors = 1e3 * np.stack([fans.tangential[..., 1], fans.sagittal[..., 0]])
@@ -354,12 +353,12 @@ def highest(limit: float, sizes: np.ndarray) -> float:
     return min(limit if limit > 0 else _LINES, _LINES, rounded_up(_FADED / blur, (1, 2, 4, 10)))
 
 
-def _circles(spots: Spots, shown: int) -> tuple[Array, Model, int]:
+def _circles(spots: Spots, shown: int) -> tuple[np.ndarray, Model, int]:
     """Radii (M,), mm, model and cells of the pupil for the encircled energy of `shown` fields. The
     model is "rays" if "waves" would need too many cells for a grid that holds the spots."""
     airy = float(np.min(spots.airy_radius))
     sizes = analyses.spot_radius(spots)[:shown]
     reach = max(np.max(sizes, initial=0, where=np.isfinite(sizes)), 3 * min(airy, 1e-2))
     cells = 64 * int(np.ceil(5 * reach / airy / 64)) if airy < np.inf else _MOST + 1
-    radii = jnp.linspace(0, reach, _RADII)
+    radii = np.linspace(0, reach, _RADII)
     return (radii, "rays", _LEAST) if cells > _MOST else (radii, "waves", max(cells, _LEAST))
