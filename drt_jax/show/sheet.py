@@ -3,14 +3,13 @@
 import dataclasses
 import functools
 import itertools
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from jax.typing import ArrayLike
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
@@ -247,7 +246,7 @@ def shown_fields(lens: Lens, scene: Scene) -> tuple[Scene, list[float]]:
     return _along_y(lens, scene, angles[picked]), np.delete(angles, picked).tolist()
 
 
-def _along_y(lens: Lens, scene: Scene, angles: ArrayLike) -> Scene:
+def _along_y(lens: Lens, scene: Scene, angles: Sequence[float] | np.ndarray) -> Scene:
     """A scene of fields along y, (F,) radians. An array of a named dtype compiles nothing."""
     along = np.asarray(angles)
     return checked_scene(lens, scene.at(jnp.asarray(np.stack([0 * along, along], -1), float)))
