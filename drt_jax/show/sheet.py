@@ -224,7 +224,7 @@ def analysed(
     waves = _waves(lens, beams, asked, len(some), model, cells)
     third: ThirdOrder | str
     try:
-        third = jax.tree.map(lambda a: np.asarray(a)[0], _third_order(lens, at(np.array([widest]))))
+        third = jax.tree.map(lambda a: np.asarray(a)[0], _third_order(lens, at([widest])))
     except ValueError as error:  # no theory for such a lens
         third = str(error)
     traced = shown, left_out, line, foci, bent, colour, fans, spots, hits
