@@ -163,8 +163,9 @@ def many_starts(
     """Searches from many starts with successive halving (Jamieson and Talwalkar 2016).
 
     Each stage takes some steps of every remaining search; the better part of them continues to the
-    next stage. A search that fails is ranked last. Where aiming misses rays at the end, the search
-    continues with the full ray search. The result does not depend on threads, tiles or devices.
+    next stage. A search that fails is ranked last. At the end, searches of which aiming misses rays
+    are evaluated with the full ray search, and the best of them all continues with it if it needs
+    it. The result does not depend on threads, tiles or devices.
 
     problem: the design problem.
     starts: (K, N).
@@ -213,13 +214,17 @@ def many_starts(
         for _ in advance(tried, alive, stage_steps):
             best.append(float(np.min(rows(alive).score)))
             callback(len(best), total, best[-1])
-    # Searches in which the full ray search finds rays that aiming does not find continue with it.
-    failed = state.evaluation.failed
-    vector = state.vector
-    missed = [k for k in alive if failed[k] and int(problem.failed(vector[k])) < failed[k]]
+    # Where aiming misses rays, the full ray search says which search is the best; that continues.
+    lost = state.evaluation.failed.copy()
+    missed = alive[lost[alive] > 0]
     state.stale[missed], state.done[missed] = True, False
-    for _ in advance(problem, np.array(missed, int), steps[-1]):
-        best.append(float(np.min(rows(alive).score)))
+    for _ in advance(problem, missed, 1):
+        pass
+    first = alive[np.argmin(rows(alive).score)]
+    if state.evaluation.failed[first] < lost[first]:
+        for _ in advance(problem, np.array([first]), steps[-1]):
+            best.append(float(state.score[first]))
+            callback(len(best), len(best), best[-1])
     total_steps, jacobians = int(np.sum(state.steps)), int(np.sum(state.jacobians))
     return Starts(
         distinct(rows(alive), alive),

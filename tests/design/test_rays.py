@@ -117,6 +117,8 @@ def test_an_optimum_is_searched_in_full(monkeypatch):
     monkeypatch.setattr("drt_jax.design.starts.solve_aimed", blind)
     found = design.optimise(problem)
     np.testing.assert_allclose(found.merit, wanted.merit, rtol=1e-9)
-    starts = design.normal_starts(variables, 4, 1.0)
-    minima = design.many_starts(problem, starts, steps=(20,)).minima
+    starts, tiles = design.normal_starts(variables, 4, 1.0), []
+    seen = lambda *tile: tiles.append(tile)  # noqa: E731
+    minima = design.many_starts(problem, starts, steps=(20,), callback=seen).minima
     np.testing.assert_allclose(minima[0].merit, wanted.merit, rtol=1e-6)
+    assert [tile[:2] for tile in tiles] == [(1, 1), (2, 2)]  # the second searches in full

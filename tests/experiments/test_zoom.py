@@ -59,18 +59,22 @@ YFIE 2 2 4 0 0
 """
 
 
+def run_of(folder, *more):
+    """Results of a search of the toy, in a folder."""
+    (folder / "toy.zmx").write_text(TOY)
+    few = [f"lens={folder / 'toy.zmx'}", "order=2", "trials=60", "tolerance=0.1"]
+    few += ["moving=[{kind: thickness, surfaces: [1], low: 1, high: 40}, {kind: sensor}]"]
+    few += ["shared=[{kind: curvature}]", "operands=[{kind: spot}, {kind: air_edge, low: 0.1}]"]
+    _command.main(zoom, ["--out", str(folder / "run"), "--set", *few, *more])
+    return json.loads((folder / "run" / "results.json").read_text())
+
+
 @pytest.mark.slow
 def test_a_zoom_is_optimised_in_both_positions(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(ROOT)
-    (tmp_path / "toy.zmx").write_text(TOY)
-    few = [f"lens={tmp_path / 'toy.zmx'}", "order=2", "trials=60", "tolerance=0.1"]
-    few += ["moving=[{kind: thickness, surfaces: [1], low: 1}, {kind: sensor}]"]
-    few += ["shared=[{kind: curvature}]", "operands=[{kind: spot}, {kind: air_edge, low: 0.1}]"]
-    few += ["keep=[{kind: effective_focal_length, per_cent: 2}]"]
-    _command.main(zoom, ["--out", str(tmp_path / "run"), "--set", *few])
+    rows = run_of(tmp_path, "keep=[{kind: effective_focal_length, per_cent: 2}]")["rows"]
     assert "gaps alone" in capsys.readouterr().out
     assert (tmp_path / "run" / "figures" / "zoom.png").is_file()
-    rows = json.loads((tmp_path / "run" / "results.json").read_text())["rows"]
     assert [row["configuration"] for row in rows] == [1, 2]
     total = {name: sum(row[f"merit_{name}"] for row in rows) for name in ("start", "moved", "end")}
     assert total["end"] < total["moved"] < total["start"]
@@ -88,14 +92,9 @@ def test_a_zoom_is_optimised_in_both_positions(tmp_path, monkeypatch, capsys):
 @pytest.mark.slow
 def test_a_zoom_is_searched_from_many_starts_for_given_focal_lengths(tmp_path, monkeypatch):
     monkeypatch.chdir(ROOT)
-    (tmp_path / "toy.zmx").write_text(TOY)
-    few = [f"lens={tmp_path / 'toy.zmx'}", "order=2", "trials=60", "tolerance=0.1"]
-    few += ["moving=[{kind: thickness, surfaces: [1], low: 1, high: 40}, {kind: sensor}]"]
-    few += ["shared=[{kind: curvature}]", "operands=[{kind: spot}, {kind: air_edge, low: 0.1}]"]
-    few += ["keep=[{kind: effective_focal_length, values: [26, 30], per_cent: 1}]"]
-    few += ["starts={count: 4, spread: 2, stages: [5, 25], keep: 1}"]
-    _command.main(zoom, ["--out", str(tmp_path / "run"), "--set", *few])
-    results = json.loads((tmp_path / "run" / "results.json").read_text())
+    keep = "keep=[{kind: effective_focal_length, values: [26, 30], per_cent: 1}]"
+    starts = "starts={count: 4, spread: 2, stages: [5, 25], keep: 1}"
+    results = run_of(tmp_path, keep, starts)
     for row, wanted in zip(results["rows"], (26, 30)):
         assert row["focal_mm_designed"] == pytest.approx(wanted, rel=0.0101)
         assert row["merit_end"] <= 1.001 * row["merit_starts"]
