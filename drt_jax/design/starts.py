@@ -207,8 +207,8 @@ def many_starts(
         sizes.append(min(sizes[-1], max(_TILE, math.ceil(survivors * sizes[-1]))))
     alive = np.arange(len(vectors))
     total = sum(-(-size // tile_size(_TILE, mesh)) for size in sizes)
-    for _ in advance(tried, alive[:1], 0):
-        compiled = time.perf_counter() - begun
+    [*advance(tried, alive[:1], 0)]
+    compiled = time.perf_counter() - begun
     for size, stage_steps in zip(sizes, steps):
         alive = alive[np.argsort(rows(alive).score, kind="stable")[:size]]
         for _ in advance(tried, alive, stage_steps):
@@ -218,24 +218,16 @@ def many_starts(
     lost = state.evaluation.failed.copy()
     missed = alive[lost[alive] > 0]
     state.stale[missed], state.done[missed] = True, False
-    for _ in advance(problem, missed, 1):
-        pass
+    [*advance(problem, missed, 1)]
     first = alive[np.argmin(rows(alive).score)]
     if state.evaluation.failed[first] < lost[first]:
         for _ in advance(problem, np.array([first]), steps[-1]):
             best.append(float(state.score[first]))
             callback(len(best), len(best), best[-1])
     total_steps, jacobians = int(np.sum(state.steps)), int(np.sum(state.jacobians))
-    return Starts(
-        distinct(rows(alive), alive),
-        np.asarray(state.score),
-        total_steps,
-        jacobians,
-        total_steps * rays_of(problem),
-        time.perf_counter() - begun,
-        compiled,
-        best,
-    )
+    counts = total_steps, jacobians, total_steps * rays_of(problem)
+    seconds, minima = time.perf_counter() - begun, distinct(rows(alive), alive)
+    return Starts(minima, np.asarray(state.score), *counts, seconds, compiled, best)
 
 
 def rays_of(problem: AnyProblem) -> int:
