@@ -4,6 +4,7 @@ import dataclasses
 import functools
 import itertools
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple
 
 import jax
@@ -205,26 +206,28 @@ def analysed(
     widest = max(map(abs, angles)) * (1 if max(angles) >= -min(angles) else -1)
     line = np.linspace(0, widest, _CURVE)
     at = functools.partial(_along_y, lens, scene)
-    say("tracing chief rays")
-    foci, bent, colour = jax.tree.map(np.asarray, along_field(lens, at(line)))
-    say("tracing fans")
-    fans = jax.tree.map(np.asarray, ray_fans(lens, shown, _FAN))
-    say("tracing spots")
-    wide = np.array([*some, *line[::_STEP]])
-    rule = rule_for(lens, at(wide), sampling, _ORDER)
-    spots = jax.tree.map(np.asarray, spot_diagram(lens, at(wide), rule))
-    hits = np.stack([beam_hits(lens, point)[:, :, -1] for point in shown.each()])
-    say("tracing waves")
-    cone = spots.solid_angle[len(some), middle]
-    limit = 2e3 * np.sqrt(cone / np.pi) / float(np.asarray(scene.wavelengths)[middle])
-    lines = np.linspace(0, highest(limit, spots.rms[: len(some)]), _FREQUENCIES)
-    radii, model, cells = _circles(spots, len(some))
-    beams = beams_of(lens, at(wide), beam_rule(_DEGREE, rule.symmetry, rule))
-    asked = scene.wavelengths, scene.spectrum, *(jnp.asarray(a, float) for a in (lines, radii))
-    waves = _waves(lens, beams, asked, len(some), model, cells)
+    say("tracing rays")
+    with ThreadPoolExecutor(1) as aside:  # Python traces one program while XLA compiles another
+        chief = aside.submit(along_field, lens, at(line))
+        crossed = aside.submit(ray_fans, lens, shown, _FAN)
+        bars = aside.submit(_third_order, lens, at([widest]))
+        wide = np.array([*some, *line[::_STEP]])
+        rule = rule_for(lens, at(wide), sampling, _ORDER)
+        spots = jax.tree.map(np.asarray, spot_diagram(lens, at(wide), rule))
+        hits = np.stack([beam_hits(lens, point)[:, :, -1] for point in shown.each()])
+        say("tracing waves")
+        cone = spots.solid_angle[len(some), middle]
+        limit = 2e3 * np.sqrt(cone / np.pi) / float(np.asarray(scene.wavelengths)[middle])
+        lines = np.linspace(0, highest(limit, spots.rms[: len(some)]), _FREQUENCIES)
+        radii, model, cells = _circles(spots, len(some))
+        beams = beams_of(lens, at(wide), beam_rule(_DEGREE, rule.symmetry, rule))
+        asked = scene.wavelengths, scene.spectrum, *(jnp.asarray(a, float) for a in (lines, radii))
+        waves = _waves(lens, beams, asked, len(some), model, cells)
+    foci, bent, colour = jax.tree.map(np.asarray, chief.result())
+    fans = jax.tree.map(np.asarray, crossed.result())
     third: ThirdOrder | str
     try:
-        third = jax.tree.map(lambda a: np.asarray(a)[0], _third_order(lens, at([widest])))
+        third = jax.tree.map(lambda a: np.asarray(a)[0], bars.result())
     except ValueError as error:  # no theory for such a lens
         third = str(error)
     traced = shown, left_out, line, foci, bent, colour, fans, spots, hits

@@ -203,7 +203,7 @@ def tables(results: dict[str, Any]) -> dict[str, str]:
     keys = ("ended", "jacobians", "seconds", "compile_s", "worst")
     searches = [[name, *map(end.get, keys)] for name, end in results["searches"].items()]
     titles = ["search", "ended", "Jacobians", "seconds", "compilation, s", "the nearest limit"]
-    name = pathlib.Path(results["lens"]).stem
+    name = pathlib.Path(results["lens"]).stem + (f", {starts['count']} starts" if starts else "")
     found = {
         f"zoom, {name}": _common.table(header, rows),
         f"zoom, {name}: searches": _common.table(titles, searches),
@@ -216,7 +216,7 @@ def tables(results: dict[str, Any]) -> dict[str, str]:
         rows += [["trials of all", starts["trials"]], ["seconds", starts["seconds"]]]
         rows += [["compilation, s", starts["compile_s"]]]
         title = f"{starts['count']} starts", ""
-        found[f"zoom, {name}: starts"] = _common.table(title, rows)
+        found[f"zoom, {name}: ends"] = _common.table(title, rows)
     return found
 
 

@@ -206,10 +206,8 @@ def as_they_are(lens, built):
     return built
 
 
-@pytest.mark.parametrize(
-    "compensator, given",
-    [("none", as_they_are), pytest.param("focus", "focus", marks=pytest.mark.slow)],
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("compensator, given", [("none", as_they_are), ("focus", "focus")])
 def test_spots_of_lenses_as_built_as_an_operand(singlet, compensator, given):
     """Its merit is that of a Monte Carlo run, and so is its derivative."""
     problem, some = singlet

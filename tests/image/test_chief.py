@@ -188,6 +188,7 @@ def test_derivatives_by_lens_numbers():
     check_slopes(lambda lens: slopes(lens, fields), COOKE, steps, 2e-6)
 
 
+@pytest.mark.slow
 def test_a_field_without_a_chief_ray_is_infinite_and_spoils_no_other():
     """Light of 2 rad comes from behind."""
     (_, found), slope = slopes(COOKE, jnp.array([[0.0, 0.1], [0.0, 1.55], [0.0, 2.0]]))

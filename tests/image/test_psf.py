@@ -247,6 +247,7 @@ def test_derivatives_are_those_of_the_kernel(double_gauss):
     np.testing.assert_allclose(gradient[1], slope, rtol=2e-5)
 
 
+@pytest.mark.slow
 def test_without_light_a_kernel_is_dark_and_its_slopes_are_nothing(double_gauss):
     (_, found), gradient = slopes(double_gauss[0], jnp.array([0.0, 1.4]), jnp.asarray(0.0))
     for one in found:

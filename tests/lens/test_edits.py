@@ -94,6 +94,7 @@ def test_a_stop_inside_of_an_element():
     np.testing.assert_allclose(first_order(inside).f_number, first_order(lens).f_number, rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_a_dummy_in_a_folded_system_moves_no_ray(shared):
     """Mirrors, coordinate breaks, apertures and the other sense of light of a lens file."""
     system = schlieren(shared)
@@ -148,6 +149,7 @@ def test_an_element_bends_at_constant_power():
     np.testing.assert_allclose(back.curvature, singlet.curvature, atol=1e-15)
 
 
+@pytest.mark.slow
 def test_numbers_may_be_traced():
     """Derivatives of all edits in one program, against differences and the plain calls."""
     lens = load_lens("cooke_triplet")

@@ -22,6 +22,7 @@ def ends(lens):
     return rays.points[..., -1, :], rays.path
 
 
+@pytest.mark.slow
 def test_a_thin_meniscus_changes_rays_by_as_little_as_it_is_thin():
     lens, found = drt_jax.load_lens("cooke_triplet"), []
     for thin in (1e-3, 1e-4, 1e-5):

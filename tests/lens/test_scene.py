@@ -36,6 +36,7 @@ def test_known_numbers_stay_known_inside_jit():
     np.testing.assert_allclose(jax.jit(spot)().covariance, spot().covariance, rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_points_of_any_shape_are_the_first_axes():
     """Each result is that of its own point, eagerly and compiled."""
     grid = Scene.grid([0.0, 0.05, 0.1], (700.0, np.inf), RGB)
