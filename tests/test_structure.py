@@ -61,7 +61,7 @@ ROOMS = {
     "experiments/designing": 923,
     "experiments/imaging": 452,
     "experiments/paper": 599,
-    "experiments/runs": 443,
+    "experiments/runs": 447,
     "experiments/speed": 1369,
     "experiments/together": 704,
     "experiments/trust": 1964,

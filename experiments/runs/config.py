@@ -86,7 +86,11 @@ def _build(cls: Any, entry: object, source: Source, prefix: str = "") -> Any:
     for key, value in entry.items():
         if key not in known:
             word = str(key)[:_LONGEST]
-            near = difflib.get_close_matches(word, known, n=1, cutoff=0.5)
+            parts = (
+                (name, getattr(kind, "__dataclass_fields__", ())) for name, kind in known.items()
+            )
+            near = [f"{name}.{word}" for name, keys in parts if word in keys]
+            near = near or difflib.get_close_matches(word, known, n=1, cutoff=0.5)
             hint = f"did you mean {prefix}{near[0]}? " if near else ""
             unknown = f"unknown key {prefix}{shown(word)[1:-1]}; {hint}"
             raise _error(source, prefix + word, f"{unknown}known here: {', '.join(known)}")

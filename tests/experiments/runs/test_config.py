@@ -44,6 +44,7 @@ def test_yaml_overrides_and_round_trip(path, tmp_path):
 
 BAD = {
     "train.bacth=8": r"--set train.bacth=8: unknown key train.bacth; did you mean train.batch\?",
+    "batch=8": r"unknown key batch; did you mean train.batch\?",
     "trian.batch=8": r"unknown key trian; did you mean train\?",
     "train.batch=eight": "train.batch: expected a whole number, got 'eight'",
     "train.batch=8.5": "train.batch: expected a whole number, got 8.5",
