@@ -11,6 +11,7 @@ import pytest
 from drt_jax import Scene, first_order, load_lens, psf_moments, save_lens, show
 from drt_jax.__main__ import _options, main
 from drt_jax.show.command import view_of
+from drt_jax.show.layout import beam_of
 
 
 @pytest.fixture
@@ -190,8 +191,16 @@ def test_a_lens_file_is_shown_as_it_is_used(tmp_path):
     assert view.note == "  ! wavelengths of the file left out: 0.6563, 0.6, 0.55 um"
     path.write_text(re.sub("YFLN.*", "YFLN 0 0 0", path.read_text()))  # the axis alone
     assert view_of(_options(["show", str(path)]))[1] == [0]
-    view = view_of(_options(["show", "singlet"]))
+    view = view_of(_options(["show", "singlet"])).lit()
     assert view[1:4] == ([0, 7, 10], np.inf, [0.6562725, 0.5875618, 0.4861327])
+
+
+@pytest.mark.slow
+def test_fields_of_a_telescope_have_light():
+    view = view_of(_options(["show", "hubble"])).lit()
+    assert view.fields == [0, 0.875, 1.25]
+    shares = [beam_of(view.lens, point).share for point in view.scene.each()]
+    assert shares[2] >= shares[0] / 2
 
 
 def test_ctrl_c_is_one_line(monkeypatch, capsys):

@@ -56,7 +56,7 @@ ROOMS = {
     "drt_jax/lens": 1886,
     "drt_jax/pupil": 774,
     "drt_jax/rays": 1320,
-    "drt_jax/show": 1430,
+    "drt_jax/show": 1448,
     "experiments": 487,
     "experiments/designing": 923,
     "experiments/imaging": 452,

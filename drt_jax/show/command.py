@@ -37,6 +37,7 @@ _LINES = (0.6562725, 0.5875618, 0.4861327)  # C, d, F
 _ORDERS, _TOLERANCE = (14, 20), 1e-3
 OTHERS = (".zmx", ".seq")
 _DEFOCUS = 3.0  # a spot larger than this many times the smallest spot is out of focus
+_HALVINGS = 8  # of the fields of a lens that names none
 _WAVES = 5  # of more wavelengths of a file, the primary, longest and shortest are shown
 MISSING = "warn: leave out what is unsupported and rays can go on without, with a warning"
 WHICH = "number of a configuration or zoom position of a .zmx or .seq file, from 1"
@@ -53,7 +54,8 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     ends = "default: those of a .zmx or .seq file with their weights, else"
     every = f"{WHICH}; or all: their layouts under each other and a table of their numbers"
     parser.add_argument("--configuration", type=configuration, help=every)
-    parser.add_argument("--field", type=float, nargs="+", help=f"degrees; {own} 0 7 10")
+    lit = f"degrees; {own} 0 7 10, halved until light arrives"
+    parser.add_argument("--field", type=float, nargs="+", help=lit)
     parser.add_argument("--distance", type=float, help=f"to the object, mm; {own} inf")
     parser.add_argument("--wavelengths", type=float, nargs="+", help=f"um; {ends} C, d and F")
     parser.add_argument("--missing", choices=("error", "warn"), default="error", help=MISSING)
@@ -78,14 +80,16 @@ def output(options: argparse.Namespace, say: Callable[[str], None]) -> Iterator[
         yield from _all_told(options)
         return
     view = view_of(options)
-    lens, fields, distance, waves, _, note = view
-    scene, middle = view.scene, waves[len(waves) // 2]
+    lens, _, distance, waves, _, note = view
+    middle = waves[len(waves) // 2]
     found = jax.tree.map(lambda a: a.item(), _first_order(lens, distance, np.array([middle])))
     about = f"{lens.count} surfaces, stop: surface {lens.stop} (counted from 0)"
     first = [*first_rows(lens, found, middle)]
     yield f"{lens.name}: {about}"
     yield from (f"  {name:<19}  {value}" for name, value in first)
     say("tracing; another kind of lens is compiled first, for half a minute or less")
+    view = view.lit()
+    scene, fields = view.scene, view.fields
     axial = beam_of(lens, scene.at(jnp.asarray(np.zeros(2), float)))
     beams = [beam_of(lens, point) for point in scene.each()]
     notes = [] if lens.afocal else [*focus_lines(found, middle, axial)]
@@ -124,7 +128,7 @@ def _all_told(options: argparse.Namespace) -> Iterator[Line]:
     require(several, f"--configuration all: {path.name} has one; expected a .zmx or .seq file")
     count = load_system(path, options.missing, 1).configurations
     each = [vars(options) | {"configuration": k} for k in range(1, count + 1)]
-    views = [view_of(argparse.Namespace(**own)) for own in each]
+    views = [view_of(argparse.Namespace(**own)).lit() for own in each]
     lenses, scenes = [view.lens for view in views], [view.scene for view in views]
     title = f"{lenses[0].name or path.stem}: {count} configurations"
     yield title
@@ -148,8 +152,9 @@ def _file_of(options: argparse.Namespace) -> tuple[pathlib.Path, bool]:
 
 
 class View(NamedTuple):
-    """What is shown: a lens, fields in degrees, the distance in mm, wavelengths in um, the middle
-    one of which is the reference, their weights, and a line on what of a file is left out, or "".
+    """What is shown: a lens, fields in degrees, none for those of `lit`, the distance in mm,
+    wavelengths in um, the middle one of which is the reference, their weights, and a line on what
+    of a file is left out, or "".
     """
 
     lens: Lens
@@ -166,10 +171,25 @@ class View(NamedTuple):
         shown = Scene.degrees(self.fields, self.distance, waves, wavelength_weights=weights)
         return checked_scene(self.lens, shown)
 
+    def lit(self) -> "View":
+        """The view with fields: if it has none, 0, 7 and 10 degrees, the last two halved until half
+        of the light of the axis arrives."""
+        if self.fields:
+            return self
+        fields = np.array([0.0, 7.0, 10.0])
+        for _ in range(_HALVINGS):
+            ends = self._replace(fields=fields[[0, 2]].tolist()).scene
+            axis, edge = (beam_of(self.lens, point).share for point in ends.each())
+            if edge >= axis / 2:
+                break
+            fields = fields / 2
+        return self._replace(fields=fields.tolist())
+
 
 def view_of(options: argparse.Namespace) -> View:
     """What the options and a file ask for. Options override the values of a .zmx or .seq file."""
-    fields, distance, waves, note = [0.0, 7.0, 10.0], math.inf, list(_LINES), ""
+    fields: list[float] = []
+    distance, waves, note = math.inf, list(_LINES), ""
     weights = {wave: 1.0 for wave in waves}
     if pathlib.Path(options.lens).suffix.lower() in OTHERS:
         system = load_system(options.lens, options.missing, options.configuration)
@@ -187,7 +207,7 @@ def view_of(options: argparse.Namespace) -> View:
         if angles is not None and not np.any(angles[:, 0]):
             fields = np.unique(np.round(np.degrees(angles[:, 1]), 12)).tolist()
         elif options.field is None:
-            warnings.warn("the file has no fields along y alone: --field 0 7 10", stacklevel=2)
+            warnings.warn("the file has no fields along y alone; give --field", stacklevel=2)
     else:
         lens = load_lens(options.lens, options.missing, options.configuration)
     distance = distance if options.distance is None else options.distance

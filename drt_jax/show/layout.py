@@ -216,6 +216,7 @@ class Beam(NamedTuple):
     ends: other failures of rays, in words.
     obscured: True if obscurations alone clip.
     wide: (S + 1,), largest distance of arriving rays from each vertex, mm; 0 if none arrives.
+    share: part of the rays in the middle wavelength that arrive.
     spot: RMS radius on the sensor, mm; nan if no light arrives. best, shift: the smallest RMS
         radius at any sensor position, and how far that position is behind the sensor, mm.
     """
@@ -224,6 +225,7 @@ class Beam(NamedTuple):
     ends: list[str]
     obscured: bool
     wide: np.ndarray
+    share: float
     spot: float
     best: float
     shift: float
@@ -247,14 +249,15 @@ def beam_of(lens: Lens, scene: Scene) -> Beam:
     obscured = _obscured(lens, hits[clipped])
     wide = np.max(np.linalg.norm(hits[arrives], axis=-1), axis=0, initial=0.0)
     inside = arrives[middle] & (np.arange(len(pupil)) < len(pupil) - _RIM)
-    if not np.any(inside):
-        return Beam(clipping, ends, obscured, wide, math.nan, math.nan, math.nan)
+    share = float(np.sum(inside)) / (len(pupil) - _RIM)
+    if not share:
+        return Beam(clipping, ends, obscured, wide, share, math.nan, math.nan, math.nan)
     hits, slopes = hits[middle, inside, -1], directions[middle, inside]
     hits, slopes = (a - a.mean(axis=0) for a in (hits, slopes[:, :2] / slopes[:, 2:]))
     size, growth = np.mean(np.sum(hits**2, axis=1)), np.mean(np.sum(slopes**2, axis=1))
     shift = -np.mean(np.sum(hits * slopes, axis=1)) / growth if growth > 0 else 0.0
     best = math.sqrt(max(size - growth * shift**2, 0.0))
-    return Beam(clipping, ends, obscured, wide, math.sqrt(size), best, float(shift))
+    return Beam(clipping, ends, obscured, wide, share, math.sqrt(size), best, float(shift))
 
 
 def beam_hits(lens: Lens, scene: Scene) -> np.ndarray:
