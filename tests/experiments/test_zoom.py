@@ -103,7 +103,7 @@ def test_a_zoom_is_searched_from_many_starts_for_given_focal_lengths(tmp_path, m
     total = sum(row["merit_end"] for row in results["rows"])
     assert total <= 1.001 * min(scores)
     assert (tmp_path / "run" / "figures" / "starts.png").is_file()
-    assert "| 4 starts" in zoom.tables(results)["zoom, toy: starts"]
+    assert "| 4 starts" in zoom.tables(results)["zoom, toy, 4 starts: ends"]
 
 
 def test_as_many_values_as_configurations_are_asked_for(tmp_path, capsys):
