@@ -49,7 +49,7 @@ ALLOWED_ALL = {"learn.__init__", *(f"show.{name}" for name in _DRAWN)}
 ROOMS = {
     "drt_jax": 368,
     "drt_jax/check": 329,
-    "drt_jax/design": 3287,
+    "drt_jax/design": 3288,
     "drt_jax/files": 3120,
     "drt_jax/image": 3012,
     "drt_jax/learn": 655,

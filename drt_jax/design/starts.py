@@ -163,9 +163,9 @@ def many_starts(
     """Searches from many starts with successive halving (Jamieson and Talwalkar 2016).
 
     Each stage takes some steps of every remaining search; the better part of them continues to the
-    next stage. A search that fails is ranked last. At the end, searches of which aiming misses rays
-    are evaluated with the full ray search, and the best of them all continues with it if it needs
-    it. The result does not depend on threads, tiles or devices.
+    next stage. A search that fails is ranked last. At the end the full ray search evaluates the
+    searches whose rays aiming misses. If the best of all is one of them, it continues with the full
+    ray search. The result does not depend on threads, tiles or devices.
 
     problem: the design problem.
     starts: (K, N).
@@ -209,21 +209,24 @@ def many_starts(
     total = sum(-(-size // tile_size(_TILE, mesh)) for size in sizes)
     [*advance(tried, alive[:1], 0)]
     compiled = time.perf_counter() - begun
+
+    def search(problem: AnyProblem, searches: np.ndarray, steps: int) -> None:
+        """Advances searches, and tells of each tile."""
+        for _ in advance(problem, searches, steps):
+            best.append(float(np.min(rows(alive).score)))
+            callback(len(best), max(total, len(best)), best[-1])
+
     for size, stage_steps in zip(sizes, steps):
         alive = alive[np.argsort(rows(alive).score, kind="stable")[:size]]
-        for _ in advance(tried, alive, stage_steps):
-            best.append(float(np.min(rows(alive).score)))
-            callback(len(best), total, best[-1])
-    # Where aiming misses rays, the full ray search says which search is the best; that continues.
+        search(tried, alive, stage_steps)
     lost = state.evaluation.failed.copy()
     missed = alive[lost[alive] > 0]
     state.stale[missed], state.done[missed] = True, False
-    [*advance(problem, missed, 1)]
+    total += -(-len(missed) // tile_size(_TILE, mesh))
+    search(problem, missed, 1)
     first = alive[np.argmin(rows(alive).score)]
     if state.evaluation.failed[first] < lost[first]:
-        for _ in advance(problem, np.array([first]), steps[-1]):
-            best.append(float(state.score[first]))
-            callback(len(best), len(best), best[-1])
+        search(problem, np.array([first]), steps[-1])
     total_steps, jacobians = int(np.sum(state.steps)), int(np.sum(state.jacobians))
     counts = total_steps, jacobians, total_steps * rays_of(problem)
     seconds, minima = time.perf_counter() - begun, distinct(rows(alive), alive)

@@ -152,9 +152,13 @@ def _file_of(options: argparse.Namespace) -> tuple[pathlib.Path, bool]:
 
 
 class View(NamedTuple):
-    """What is shown: a lens, fields in degrees, none for those of `lit`, the distance in mm,
-    wavelengths in um, the middle one of which is the reference, their weights, and a line on what
-    of a file is left out, or "".
+    """What is shown.
+
+    lens: the lens.
+    fields: degrees; an empty list if neither options nor file name any, see `lit`.
+    distance: of the object, mm.
+    wavelengths, weights: um, the middle one is the reference; and their weights.
+    note: a line on what of a file is left out, or "".
     """
 
     lens: Lens

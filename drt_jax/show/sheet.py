@@ -208,9 +208,9 @@ def analysed(
     at = functools.partial(_along_y, lens, scene)
     say("tracing rays")
     with ThreadPoolExecutor(1) as aside:  # Python traces one program while XLA compiles another
-        chief = aside.submit(along_field, lens, at(line))
-        crossed = aside.submit(ray_fans, lens, shown, _FAN)
-        bars = aside.submit(_third_order, lens, at([widest]))
+        of_chief = aside.submit(along_field, lens, at(line))
+        of_fans = aside.submit(ray_fans, lens, shown, _FAN)
+        of_third = aside.submit(_third_order, lens, at([widest]))
         wide = np.array([*some, *line[::_STEP]])
         rule = rule_for(lens, at(wide), sampling, _ORDER)
         spots = jax.tree.map(np.asarray, spot_diagram(lens, at(wide), rule))
@@ -223,11 +223,11 @@ def analysed(
         beams = beams_of(lens, at(wide), beam_rule(_DEGREE, rule.symmetry, rule))
         asked = scene.wavelengths, scene.spectrum, *(jnp.asarray(a, float) for a in (lines, radii))
         waves = _waves(lens, beams, asked, len(some), model, cells)
-    foci, bent, colour = jax.tree.map(np.asarray, chief.result())
-    fans = jax.tree.map(np.asarray, crossed.result())
+    foci, bent, colour = jax.tree.map(np.asarray, of_chief.result())
+    fans = jax.tree.map(np.asarray, of_fans.result())
     third: ThirdOrder | str
     try:
-        third = jax.tree.map(lambda a: np.asarray(a)[0], bars.result())
+        third = jax.tree.map(lambda a: np.asarray(a)[0], of_third.result())
     except ValueError as error:  # no theory for such a lens
         third = str(error)
     traced = shown, left_out, line, foci, bent, colour, fans, spots, hits
