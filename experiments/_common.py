@@ -1,5 +1,6 @@
 """What the experiments share: checks of settings, results on disk, tables, measured time."""
 
+import dataclasses
 import importlib.util
 import io
 import json
@@ -13,7 +14,7 @@ import jax
 import numpy as np
 from tqdm import tqdm
 
-from drt_jax import Lens, Scene, psf_moments
+from drt_jax import Lens, Scene, load_lens, psf_moments
 
 from .runs.config import ConfigError
 from .runs.folder import Run
@@ -99,6 +100,22 @@ Numbers = Annotated[tuple[float, ...], not_empty, different]
 # Wavelengths in um, also those of R, G and B.
 Wavelengths = Annotated[Numbers, within(1e-4, 1e6)]
 Colours = Annotated[tuple[float, ...], three_colours, within(1e-4, 1e6)]
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class LensFile:
+    """Settings that name a lens.
+
+    lens: bundled name, or path of a .yaml, .zmx or .seq file.
+    configuration: of a .zmx or .seq file that has several, from 1; null for the one it is in.
+    """
+
+    lens: str
+    configuration: int | None = None
+
+    def load(self) -> Lens:
+        """The lens. LensError as of `load_lens`."""
+        return load_lens(self.lens, configuration=self.configuration)
 
 
 def require_known(name: str, values: tuple[str, ...], known: Iterable[str]) -> None:

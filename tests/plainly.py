@@ -39,7 +39,7 @@ def numbers():
         jnp.max(drt_jax.psf(lens, Scene.point(0.2, 1e4, RGB), 0.02, 9, sampling=model).kernel),
     )
     perturbed = design.PerturbedLens.from_lens(
-        lens, lens.semi_diameter[:-1], [design.Tolerance("shift", 0.05)]
+        lens, lens.semi_diameter[:-1], [design.Tolerance("decentre", 0.05)]
     )
     problem = design.Problem.from_variables(
         design.Variables.from_lens(perturbed.lens, ["sensor"]),

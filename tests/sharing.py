@@ -39,7 +39,7 @@ def monte_carlo(mesh):
     lens = drt_jax.load_lens(LENS)
     problem, sizes = (
         problem_of(lens),
-        [design.Tolerance("shift", 0.02), design.Tolerance("radius", 0.2)],
+        [design.Tolerance("decentre", 0.02), design.Tolerance("radius", 0.2)],
     )
     perturbed = design.PerturbedLens.from_lens(lens, problem.beam_radius(lens), sizes)
     problem = problem_of(perturbed.lens)

@@ -27,6 +27,8 @@ def test_a_lens_shows_itself(tmp_path, capsys):
     main([*words, "--out", str(picture)])
     lines = capsys.readouterr().out.splitlines()
     assert picture.stat().st_size > 10_000 and lines[-1] == f"drawn in {picture}"
+    (drawn,) = (k for k, line in enumerate(lines) if line.startswith("the lens is drawn in"))
+    assert drawn < next(k for k, line in enumerate(lines) if line.startswith(" field"))
     focal = next(float(line.split()[2]) for line in lines if "focal length" in line)
     assert 45 < focal < 55
     table = [line.split() for line in lines if line.split()[:1] in (["0"], ["5"])]

@@ -47,7 +47,7 @@ class Assembly:
     compensator: what is adjusted in each lens. "none"; "focus", the distance of the sensor; "focus
         and tilt", also its tilts about x and y; or tolerances, each of which names parts and the
         largest adjustment in both directions: Tolerance("thickness", 0.3, (4,)) is a spacer,
-        Tolerance("shift", 0.1, (1,)) an element that is centred, Tolerance("sensor", 1) the focus.
+        Tolerance("decentre", 0.1, (1,)) an element that is centred, Tolerance("sensor", 1) focus.
         Of several configurations each has its own focus (and tilt), while all share "common focus"
         and the adjustments of tolerances, except those with `own`.
     criterion: the figure of merit: an operand, its name, or a function of a lens and its

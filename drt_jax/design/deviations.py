@@ -25,7 +25,7 @@ _MINUTE = math.pi / 180 / 60
 _WITH_X = ("biconic", "toroid")
 # The keys of `KINDS`, for type checkers and settings; a test compares them.
 ToleranceKind = Literal[
-    "radius", "fringes", "irregularity", "wedge", "thickness", "index", "abbe", "shift",
+    "radius", "fringes", "irregularity", "wedge", "thickness", "index", "abbe", "decentre",
     "tilt", "sensor", "sensor tilt"
 ]  # fmt: skip
 
@@ -202,7 +202,7 @@ KINDS: dict[str, Kind] = {
     ),
     "index": Kind("surface", 1, "", _pieces, partial(_with_glass, "index"), why_none=_NO_GLASS),
     "abbe": Kind("surface", 1, "%", _pieces, partial(_with_glass, "abbe"), 100, _NO_GLASS),
-    "shift": Kind("element", 2, "mm", _elements, partial(_moved, "shift", 1)),
+    "decentre": Kind("element", 2, "mm", _elements, partial(_moved, "shift", 1)),
     "tilt": Kind("element", 2, "arc min", _elements, partial(_moved, "tilt", _MINUTE)),
     "sensor": Kind("sensor", 1, "mm", lambda lens: [0], partial(_with_part, "sensor", 1)),
     "sensor tilt": Kind(

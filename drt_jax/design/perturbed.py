@@ -29,8 +29,8 @@ class Tolerance:
         directions (half of them along y, and minus half of them along x); "wedge", a tilt about x
         and y, arc minutes.
         Behind surfaces: "thickness", mm; "index", of the d line; "abbe", per cent.
-        Of elements: "shift" along x and y, mm; "tilt" about x and y through the first vertex, arc
-        minutes.
+        Of elements: "decentre" along x and y, mm; "tilt" about x and y through the first vertex,
+        arc minutes.
         Of the sensor: "sensor", its distance, mm; "sensor tilt" about x and y, arc minutes.
     size: largest deviation, in these units.
     which: numbers of surfaces or elements, from 0; () for all that have this kind of deviation.

@@ -101,18 +101,18 @@ def written_names(names: Sequence[str]) -> tuple[list[str], dict[str, str]]:
 
 
 def to_ours(nd: float, vd: float, above: float) -> tuple[float, float, float]:
-    """nd, vd and partial of our model glass from nd, vd and dP of a file."""
+    """nd, vd and dPgF of our model glass from nd, vd and dP of a file."""
     mean = (nd - 1) / vd
     terms = mean * (_M1 + (NORMAL_LINE[0] + NORMAL_LINE[1] * vd + above) * _M2)
     terms[0] += nd
     d, f, c, g = (np.array(FRAUNHOFER)[:, None] ** _POWERS) @ terms
     abbe = (d - 1) / (f - c)
-    partial = float((g - f) / (f - c) - NORMAL_LINE[0] - NORMAL_LINE[1] * abbe)
-    return float(d), float(abbe), partial if abs(partial) > _ROUNDING else 0.0
+    dPgF = float((g - f) / (f - c) - NORMAL_LINE[0] - NORMAL_LINE[1] * abbe)
+    return float(d), float(abbe), dPgF if abs(dPgF) > _ROUNDING else 0.0
 
 
 def to_theirs(nd: float, vd: float, above: float) -> tuple[float, float, float]:
-    """nd, vd and dP of a file from nd, vd and partial of our model glass."""
+    """nd, vd and dP of a file from nd, vd and dPgF of our model glass."""
     lines = np.array(FRAUNHOFER)[:, None] ** _POWERS
     mean = (nd - 1) / vd
     wanted = np.array([nd - 1, mean, (NORMAL_LINE[0] + NORMAL_LINE[1] * vd + above) * mean])
@@ -121,8 +121,8 @@ def to_theirs(nd: float, vd: float, above: float) -> tuple[float, float, float]:
     own = np.stack([np.array([1.0, 0, 0]), _M1, _M2], axis=1)
     index, mean, part = np.linalg.solve(own, terms)
     abbe = index / mean
-    partial = float(part / mean - NORMAL_LINE[0] - NORMAL_LINE[1] * abbe)
-    return float(1 + index), float(abbe), partial
+    dPgF = float(part / mean - NORMAL_LINE[0] - NORMAL_LINE[1] * abbe)
+    return float(1 + index), float(abbe), dPgF
 
 
 def model_keys(row: Row, line: int, nd: float, vd: float, above: float) -> dict[str, Any]:
@@ -131,7 +131,7 @@ def model_keys(row: Row, line: int, nd: float, vd: float, above: float) -> dict[
     if not vd:
         return {"index": nd}
     require_glass(row, line, nd, vd)
-    return dict(zip(("nd", "vd", "partial"), to_ours(nd, vd, above), strict=True))
+    return dict(zip(("nd", "vd", "dPgF"), to_ours(nd, vd, above), strict=True))
 
 
 def require_glass(row: Row, line: int, nd: float, vd: float) -> None:

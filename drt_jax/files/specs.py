@@ -32,7 +32,7 @@ from .entry import STEEP, WIDE, Entry, LensError, array, require, table
 SURFACES = 5000  # surfaces
 _ELEMENTS = 500
 _DENSEST = 10  # index
-MEDIUM_KEYS = ("glass", "index", "nd", "vd", "partial")
+MEDIUM_KEYS = ("glass", "index", "nd", "vd", "dPgF")
 _FOCUS = "focus"  # value of `sensor`
 _TOP_KEYS = (
     *("name", "source", "focal_length", "glasses", "object", "surfaces", "elements"),
@@ -175,12 +175,12 @@ def _medium(entry: Entry, own: dict[str, Glass]) -> Glass:
     both = ("nd" in entry) == ("vd" in entry)
     entry.require(both, "", "nd and vd make a model glass together: give both or neither")
     if "nd" in entry:
-        values = entry.number("nd"), entry.number("vd"), entry.number("partial", 0.0)
+        values = entry.number("nd"), entry.number("vd"), entry.number("dPgF", 0.0)
         with entry.naming("nd"):
             glass = model_glass(*values)
         return glass
     what = "belongs to a model glass: give nd and vd as well"
-    entry.require("partial" not in entry, "partial", what)
+    entry.require("dPgF" not in entry, "dPgF", what)
     if "index" in entry:
         value = entry.number("index")
         entry.require(1 <= value <= _DENSEST, "index", f"{value:g} is not between 1 and {_DENSEST}")

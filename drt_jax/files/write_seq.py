@@ -149,9 +149,9 @@ def _made(keys: dict[str, Any], waves: np.ndarray) -> tuple[dict[str, Any], floa
     is off elsewhere. Empty for other media."""
     if "index" in keys:
         return {"schott": [keys["index"] ** 2]}, 0.0
-    if not keys.get("partial"):
+    if not keys.get("dPgF"):
         return {}, 0.0
-    glass = Dispersion.of([model_glass(keys["nd"], keys["vd"], keys["partial"])])
+    glass = Dispersion.of([model_glass(keys["nd"], keys["vd"], keys["dPgF"])])
     held = [*dict.fromkeys([*waves.tolist(), *FRAUNHOFER[:3]])][:5]
     at = np.array([*held, *np.linspace(*VISIBLE, 99)])
     indices = np.asarray(refractive_index(glass, jnp.asarray(at)), float)[0]

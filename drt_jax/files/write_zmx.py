@@ -176,7 +176,7 @@ def _glass(lens: Lens, m: int, names: Mapping[str, str]) -> list[str]:
         return [f"GLAS ___BLANK 1 0 {keys['index']!r} 0 0"]
     if not keys:
         return []
-    ours = keys["nd"], keys["vd"], keys.get("partial", 0.0)
+    ours = keys["nd"], keys["vd"], keys.get("dPgF", 0.0)
     theirs = to_theirs(*ours)
     rounded = ([round(value, digits) for value in theirs] for digits in range(3, 17))
     # The fewest digits that read back.

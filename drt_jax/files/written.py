@@ -157,8 +157,8 @@ def medium_of(lens: Lens, i: int) -> dict[str, Any] | None:
         what = f"glasses[{i}]: a prescription has no constants beside nd and vd"
         require(not own.keys() - {"range"}, what)
         nd, vd = np.asarray(lens.dispersion.model[i]).tolist()
-        partial = lens.dispersion.partial
-        above = {} if partial is None or not partial[i] else {"partial": float(partial[i])}
+        dPgF = lens.dispersion.dPgF
+        above = {} if dPgF is None or not dPgF[i] else {"dPgF": float(dPgF[i])}
         return {"nd": nd, "vd": vd} | above
     if not own:
         return {}

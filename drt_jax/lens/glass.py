@@ -39,7 +39,7 @@ class Glass:
         L^4, L^-10, L^-12, L^6.
     range: shortest and longest wavelength for which the constants hold, um.
     model: nd and vd of a model glass, see `model_glass`.
-    partial: P_gF of a model glass less that of the normal line.
+    dPgF: P_gF of a model glass less that of the normal line.
     maker, source: as in the table of glasses; "" for none.
     thermal: D0 (1/K), D1 (1/K^2), D2 (1/K^3), E0 (um^2/K), E1 (um^2/K^2) and L_TK (um) of Schott's
         formula for the absolute index at another temperature, see `design.at_temperature`; empty
@@ -55,7 +55,7 @@ class Glass:
     schott: tuple[float, ...] = (1.0, 0.0, 0.0, 0.0, 0.0, 0.0)
     range: tuple[float, float] = ANY
     model: tuple[float, float] = _NO_MODEL
-    partial: float = 0.0
+    dPgF: float = 0.0
     maker: str = ""
     source: str = ""
     thermal: tuple[float, ...] = ()
@@ -77,7 +77,7 @@ class Dispersion:
     schott: (M, K), see `Glass`.
     ranges: (M, 2), shortest and longest wavelength at which each index is known, um.
     model: (M, 2), nd and vd of model glasses, nd = 1 for other media; None without any.
-    partial: (M,), P_gF of model glasses less that of the normal line; None if all are 0.
+    dPgF: (M,), P_gF of model glasses less that of the normal line; None if all are 0.
     thermal: (M, 5), change from the temperature of the constants, see `design.at_temperature`: of
         Schott's formula D0 d + D1 d^2 + D2 d^3, E0 d + E1 d^2 (um^2) and L_TK^2 (um^2), and the
         density of the air before and now, relative to 15 C and one atmosphere; 0 for air. None at
@@ -89,7 +89,7 @@ class Dispersion:
     schott: Array
     ranges: Array
     model: Array | None = None
-    partial: Array | None = None
+    dPgF: Array | None = None
     thermal: Array | None = None
 
     @property
@@ -120,7 +120,7 @@ class Dispersion:
         terms = max(3, *(half.shape[1] for half in halves))
         padded = np.stack([np.pad(half, ((0, 0), (0, terms - half.shape[1]))) for half in halves])
         powers = max(len(m.schott) for m in media)
-        models, partial = [m.model for m in media], [m.partial for m in media]
+        models, dPgF = [m.model for m in media], [m.dPgF for m in media]
 
         def array(values):
             return jax.device_put(np.asarray(values, jnp.result_type(float)))
@@ -131,27 +131,27 @@ class Dispersion:
             schott=array([[*m.schott, *[0.0] * (powers - len(m.schott))] for m in media]),
             ranges=array([m.range for m in media]),
             model=array(models) if set(models) != {_NO_MODEL} else None,
-            partial=array(partial) if any(partial) else None,
+            dPgF=array(dPgF) if any(dPgF) else None,
         )
 
 
-def model_glass(nd: float, vd: float, partial: float = 0.0) -> Glass:
+def model_glass(nd: float, vd: float, dPgF: float = 0.0) -> Glass:
     """A glass of given nd and Abbe number vd = (nd - 1) / (nF - nC).
 
     Its index follows Conrady's formula n = A + B / L + C / L^3.5 through nd, nF - nC and ng - nF =
-    P_gF (nF - nC), with P_gF = 0.6438 - 0.001682 vd + partial.
+    P_gF (nF - nC), with P_gF = 0.6438 - 0.001682 vd + dPgF.
 
     nd: index at the d line.
     vd: Abbe number.
-    partial: P_gF less that of Schott's normal line.
+    dPgF: P_gF less that of Schott's normal line.
 
-    ValueError unless 1 < nd <= 4, 10 <= vd <= 120 and -0.2 <= partial <= 0.2.
+    ValueError unless 1 < nd <= 4, 10 <= vd <= 120 and -0.2 <= dPgF <= 0.2.
     """
-    is_glass, is_near = 1 < nd <= 4 and 10 <= vd <= 120, abs(partial) <= _FARTHEST
+    is_glass, is_near = 1 < nd <= 4 and 10 <= vd <= 120, abs(dPgF) <= _FARTHEST
     require(is_glass, f"expected 1 < nd <= 4 and 10 <= vd <= 120, got {nd:g} and {vd:g}")
-    require(is_near, f"expected P_gF within {_FARTHEST:g} of the normal line, got {partial:g}")
-    name = f"model {nd!r} {vd!r}" + (f" {partial!r}" if partial else "")
-    return Glass(name, range=VISIBLE, model=(nd, vd), partial=partial)
+    require(is_near, f"expected dPgF within {_FARTHEST:g} of 0, got {dPgF:g}")
+    name = f"model {nd!r} {vd!r}" + (f" {dPgF!r}" if dPgF else "")
+    return Glass(name, range=VISIBLE, model=(nd, vd), dPgF=dPgF)
 
 
 def nd_and_vd(dispersion: Dispersion) -> Array:
@@ -184,7 +184,7 @@ def with_media(dispersion: Dispersion, rows: np.ndarray, other: Dispersion) -> D
             old, new = (jnp.pad(a, ((0, 0), (0, width - a.shape[1]))) for a in (old, new))
         return jnp.where(mask, new, old)
 
-    nones = {"model": [_NO_MODEL], "partial": [0.0], "thermal": [[0.0] * 5]}
+    nones = {"model": [_NO_MODEL], "dPgF": [0.0], "thermal": [[0.0] * 5]}
     names = (field.name for field in dataclasses.fields(Dispersion))
     return Dispersion(**{name: mixed(name, nones.get(name)) for name in names})
 
@@ -201,7 +201,7 @@ def with_models(dispersion: Dispersion, rows: np.ndarray) -> Dispersion:
     return with_media(dispersion, rows, models)
 
 
-def _model_index(model: Array, partial: Array | None, wavelengths: Array) -> Array:
+def _model_index(model: Array, dPgF: Array | None, wavelengths: Array) -> Array:
     """n - 1 of model glasses, (M, W); 0 for other media. Arguments as in `Dispersion`.
 
     Inverts the 3 x 3 system for A - 1, B and C of Conrady's formula.
@@ -210,7 +210,7 @@ def _model_index(model: Array, partial: Array | None, wavelengths: Array) -> Arr
     formula = np.linalg.inv(np.stack([d, f - c, g - f])).T
     nd, vd = model[:, 0], model[:, 1]
     mean = (nd - 1) / vd
-    above = NORMAL_LINE[0] + NORMAL_LINE[1] * vd + (0 if partial is None else partial)
+    above = NORMAL_LINE[0] + NORMAL_LINE[1] * vd + (0 if dPgF is None else dPgF)
     known = jnp.stack([nd - 1, mean, above * mean], axis=-1)
     powers = jnp.stack([wavelengths**p for p in _CONRADY])
     # A medium with a dispersion formula has no model.
@@ -253,7 +253,7 @@ def refractive_index(dispersion: Dispersion, wavelengths: Array) -> Array:
     powers = jnp.stack([(wavelengths if p > -9 else within) ** p for p in POWERS[:count]])
     index = safe_sqrt(sellmeier + matmul(dispersion.schott, powers))
     if dispersion.model is not None:
-        index = index + _model_index(dispersion.model, dispersion.partial, wavelengths)
+        index = index + _model_index(dispersion.model, dispersion.dPgF, wavelengths)
     if dispersion.thermal is None:
         return index
     # From relative to absolute, by Schott's formula, and back to relative: to other air.

@@ -11,6 +11,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from matplotlib.figure import Figure
 
 from ..compilation import ONCE, jit
 from ..files.load import lens_names, load_lens, load_system
@@ -26,7 +27,7 @@ from ..pupil.rules import Gauss, Pattern, PupilRule, Symmetry, gauss_points, sym
 from ..rays.status import Status
 from .configurations import configuration_table, configurations
 from .figures import new
-from .layout import ENDS, Beam, beam_of
+from .layout import ENDS, Beam, beam_of, draw, lens_drawing
 from .more import more_panels
 from .page import Part, page
 from .prescription import first_rows, prescription
@@ -90,6 +91,13 @@ def output(options: argparse.Namespace, say: Callable[[str], None]) -> Iterator[
     say("tracing; another kind of lens is compiled first, for half a minute or less")
     view = view.lit()
     scene, fields = view.scene, view.fields
+    out, web = _file_of(options)
+    # The drawing is there in seconds; the sheet, or the whole page, replaces it.
+    data: list[tuple[str, Part]] = [("First-order data", first)]
+    drawing, axes = new(1, 1, 11.0, 4.5)
+    lens_drawing(axes, draw(lens, scene))
+    _write(out, drawing if not web else page(lens.name, [*data, ("Layout", drawing)]))
+    yield f"the lens is drawn in {out}; its analyses follow there"
     axial = beam_of(lens, scene.at(jnp.asarray(np.zeros(2), float)))
     beams = [beam_of(lens, point) for point in scene.each()]
     notes = [] if lens.afocal else [*focus_lines(found, middle, axial)]
@@ -100,24 +108,23 @@ def output(options: argparse.Namespace, say: Callable[[str], None]) -> Iterator[
         table.append(row)
         yield row
     yield from (wide := [*aperture_lines(lens, beams)])
-    out, web = _file_of(options)
     symmetry, cut = symmetry_of(lens, scene.field), any(beam.clips for beam in beams)
     rule = Clipped(8, symmetry, 8, may_cross(lens)) if cut else Gauss(8, symmetry)
     shown = lens, scene, rule, say
     if not web:
         figure = sheet(*shown)
         figure.text(0.01, 0.01, note.strip(" !"), fontsize=7)
-        figure.savefig(out)
+        _write(out, figure)
         yield f"drawn in {out}"
         return
     rows = [row for row in table if not isinstance(row, str)]
     lines = [*notes, *wide, *(line for line in table if isinstance(line, str))]
-    parts: list[tuple[str, Part]] = [("First-order data", first), ("Spots and light", rows)]
+    parts: list[tuple[str, Part]] = [*data, ("Spots and light", rows)]
     parts += [("Warnings", "\n".join(lines))] if lines else []
     used = np.max([beam.wide for beam in beams], axis=0)[:-1]
     parts += [*prescription(lens, used).items(), *panels(*shown).items()]
     parts += [*more_panels(lens, scene, say).items()] if options.all else []
-    out.write_text(page(f"{lens.name}: {about}", parts), encoding="utf-8")
+    _write(out, page(f"{lens.name}: {about}", parts))
     yield f"drawn in {out}, {out.stat().st_size / 1024:.0f} kB"
 
 
@@ -137,11 +144,18 @@ def _all_told(options: argparse.Namespace) -> Iterator[Line]:
     configurations([*np.ravel(axes)], lenses, scenes)
     out, web = _file_of(options)
     if web:
-        parts: list[tuple[str, Part]] = [("Configurations", rows), ("Layouts", figure)]
-        out.write_text(page(title, parts), encoding="utf-8")
+        _write(out, page(title, [("Configurations", rows), ("Layouts", figure)]))
     else:
-        figure.savefig(out)
+        _write(out, figure)
     yield f"drawn in {out}"
+
+
+def _write(out: pathlib.Path, shown: Figure | str) -> None:
+    """Write a figure, or the text of a page."""
+    if isinstance(shown, str):
+        out.write_text(shown, encoding="utf-8")
+    else:
+        shown.savefig(out)
 
 
 def _file_of(options: argparse.Namespace) -> tuple[pathlib.Path, bool]:

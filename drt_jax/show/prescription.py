@@ -88,8 +88,8 @@ def _medium(lens: Lens, i: int) -> str:
         return "mirror"
     if not name.startswith("model "):
         return name
-    nd, vd, partial, *_ = [*map(float, name.split()[1:]), 0.0]
-    more = f", dPgF {partial:.5f}" if abs(partial) > 5e-6 else ""
+    nd, vd, dPgF, *_ = [*map(float, name.split()[1:]), 0.0]
+    more = f", dPgF {dPgF:.5f}" if abs(dPgF) > 5e-6 else ""
     return f"nd {nd:.5f}, vd {vd:.5g}{more}"
 
 

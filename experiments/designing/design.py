@@ -24,7 +24,7 @@ from drt_jax.design.growth import SHORTEST, grow_once, start_growth
 from drt_jax.lens.glasses import glass_makers, nearest_glasses
 
 from . import _command, _common
-from ._common import not_empty, require, require_known, within
+from ._common import LensFile, not_empty, require, require_known, within
 from ._design_report import draw as draw, tables as tables
 from ._searches import Progress, Starts, searched, starts_of as starts_of
 from .runs.folder import Run
@@ -71,10 +71,10 @@ class Glasses:
 
 
 @dataclasses.dataclass(frozen=True)
-class Config:
+class Config(LensFile):
     """Settings of the experiment; see configs/design/.
 
-    lens: start, a bundled name or YAML path.
+    lens: the start.
     variables, ties, solves, operands: see drt_jax.design.
     fields_deg: field angles along y.
     wavelengths_um, colour_weights: wavelengths and their weights; empty for equal weights.
@@ -89,7 +89,6 @@ class Config:
     """
 
     name: str
-    lens: str
     variables: Annotated[tuple[Vary, ...], not_empty]
     operands: Annotated[tuple[Operand, ...], not_empty]
     fields_deg: Annotated[tuple[float, ...], within(-89, 89), not_empty] = (0.0,)
@@ -238,7 +237,7 @@ def _foci(config: Config, lens: drt_jax.Lens) -> list[float]:
 
 def run(config: Config, run: Run) -> dict[str, Any]:
     """Grows, searches, finishes, and writes the lens."""
-    start = drt_jax.load_lens(config.lens)
+    start = config.load()
     start = design.open_apertures(start) if config.floating else start
     model = not config.glasses.makers or start.dispersion.model is not None
     none = f"glasses: {config.lens} has no model glass; give nd and vd in place of its glasses"

@@ -102,7 +102,7 @@ class _Search:
 
     def start(self) -> list[dict[str, Any]]:
         """Row of the lens itself, optimised."""
-        lens = design.open_apertures(drt_jax.load_lens(self.config.design.lens))
+        lens = design.open_apertures(self.config.design.load())
         problem = self.problem(lens)
         best = design.optimise(problem, problem.variables.start, self.config.design.trials)
         return [self.told("0_0", problem, best, {})]

@@ -17,7 +17,7 @@ import drt_jax
 from drt_jax import Scene, design
 
 from . import _command, _common, _plots
-from ._common import Numbers, Wavelengths, not_empty, within
+from ._common import LensFile, Numbers, Wavelengths, not_empty, within
 from .runs.folder import Run
 
 # Moves of the sensor that find the focus, relative to its place.
@@ -33,10 +33,10 @@ class Mount:
 
 
 @dataclasses.dataclass(frozen=True)
-class Config:
+class Config(LensFile):
     """Settings of the experiment.
 
-    lens: a bundled lens or a file; all its glasses are of the table.
+    lens: all its glasses are of the table.
     fields_deg: in degrees. distance_mm: of the object; .inf for infinity.
     mounts: of all air spaces.
     celsius: temperatures.
@@ -82,7 +82,7 @@ def row_of(config: Config, lens: drt_jax.Lens, mount: Mount, celsius: float) -> 
 def run(config: Config, run: Run) -> dict[str, Any]:
     """Focuses the lens at 20 C, and takes it to all temperatures in all mounts."""
     scene = Scene.degrees(config.fields_deg, config.distance_mm, config.wavelengths_um)
-    lens = focused(config, drt_jax.load_lens(config.lens), scene)
+    lens = focused(config, config.load(), scene)
     jobs = {}
     for mount, celsius in itertools.product(config.mounts, config.celsius):
         jobs[f"{mount.name} {celsius:g}"] = partial(row_of, config, lens, mount, celsius)

@@ -35,7 +35,7 @@ from drt_jax.design.deviations import KINDS
 from drt_jax.design.tolerance import Order
 
 from . import _command, _common, _plots, _sharing
-from ._common import Numbers, not_empty, within
+from ._common import LensFile, Numbers, not_empty, within
 from .runs.folder import Run
 
 _ORDERS = get_args(Order)
@@ -57,10 +57,9 @@ def _pairs(fields: tuple[tuple[float, ...], ...]) -> str:
 
 
 @dataclasses.dataclass(frozen=True)
-class Config:
+class Config(LensFile):
     """Settings of the experiment; see configs/tolerance.yaml.
 
-    lens: bundled name or YAML path.
     tolerances: see drt_jax.design.
     fields_deg: pairs x, y.
     wavelengths_um, colour_weights: wavelengths and their weights; empty for equal weights.
@@ -74,7 +73,6 @@ class Config:
     devices: that share the lenses of Monte Carlo, see docs/devices.md.
     """
 
-    lens: str
     tolerances: Annotated[tuple[design.Tolerance, ...], not_empty]
     fields_deg: Annotated[tuple[tuple[float, ...], ...], not_empty, _pairs] = ((0.0, 0.0),)
     distance_mm: float = math.inf
@@ -101,7 +99,7 @@ class Study:
 
     def __init__(self, config: Config) -> None:
         self.config, self.normal = config, config.errors == "normal"
-        lens = drt_jax.load_lens(config.lens)
+        lens = config.load()
         radius = self._problem(lens).beam_radius(lens)
         self.perturbed = design.PerturbedLens.from_lens(lens, radius, config.tolerances)
         self.problem = self._problem(self.perturbed.lens)

@@ -26,7 +26,7 @@ from drt_jax.inputs import one_line
 from drt_jax.learn import images
 
 from . import _command, _common, _plots
-from ._common import odd, or_zero, three_colours, within
+from ._common import LensFile, odd, or_zero, three_colours, within
 from .runs.config import ConfigError
 from .runs.folder import Run
 
@@ -37,10 +37,9 @@ _BEYOND = 1e-3  # fraction of light outside the kernels above which the table wa
 
 
 @dataclasses.dataclass(frozen=True)
-class Scene:
+class Scene(LensFile):
     """The lens and its scene.
 
-    lens: bundled name or YAML path.
     wavelengths_um: wavelengths of R, G, B.
     distance_m: distance of the object, .inf for infinity.
     depth: picture of the size of the photograph, linear in 1 / distance, white for `near_m`, black
@@ -131,7 +130,7 @@ def run(config: Config, run: Run) -> dict[str, Any]:
     """Renders the photograph."""
     pixels = _read("photo", config.photo)
     shape = pixels.shape[:2]
-    lens = drt_jax.load_lens(config.scene.lens)
+    lens = config.scene.load()
     waves = config.scene.wavelengths_um
     distance = _distance(config, shape)
     focal = float(np.mean(drt_jax.first_order(lens, jnp.inf, waves).effective_focal_length))

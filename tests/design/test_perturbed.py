@@ -73,11 +73,11 @@ def test_elements_are_what_glass_holds_together():
     np.testing.assert_allclose(changed[1:3, 1], 1e-3, rtol=1e-10)
 
 
-def test_shifts_and_tilts_are_those_of_elements_in_a_prescription():
-    some = perturbed(lens_of(), Tolerance("shift", 0.1), Tolerance("tilt", 6, (1,)))
+def test_decentres_and_tilts_are_those_of_elements_in_a_prescription():
+    some = perturbed(lens_of(), Tolerance("decentre", 0.1), Tolerance("tilt", 6, (1,)))
     assert list(map(str, some.deviations)) == [
-        *("shift of element 0, x", "shift of element 0, y"),
-        *("shift of element 1, x", "shift of element 1, y"),
+        *("decentre of element 0, x", "decentre of element 0, y"),
+        *("decentre of element 1, x", "decentre of element 1, y"),
         *("tilt of element 1, x", "tilt of element 1, y"),
     ]
     by_hand = lens_of(
@@ -97,7 +97,7 @@ def test_elements_move_within_those_of_the_prescription():
     cell = {"surfaces": [4, "sensor"], "tilt": [10, 0, 0], "shift": [0, 1, 0]}
     inner = {"surfaces": [5, 5], "shift": [0.3, 0, 0]}
     lens = lens_of(elements=[inner, cell])
-    some = perturbed(lens, Tolerance("shift", 0.1, (1,)), Tolerance("tilt", 60, (1,)))
+    some = perturbed(lens, Tolerance("decentre", 0.1, (1,)), Tolerance("tilt", 60, (1,)))
     z, across, turned = some.lens_of(jnp.array([1.0, 0, 0, 1])).places
     found = np.c_[across, z]
     degree = math.pi / 180
@@ -236,7 +236,7 @@ def leaves(lens):
         ("radii", {}, "kind: expected one of radius, fringes"),
         ("radius", {"size": 0.0}, "radius: size: must be above 0 and below 100, got 0"),
         ("radius", {"size": 100.0}, "radius: size: must be above 0 and below 100, got 100"),
-        ("shift", {"size": -1.0}, "shift: size: must be above 0, got -1"),
+        ("decentre", {"size": -1.0}, "decentre: size: must be above 0, got -1"),
         ("tilt", {"size": math.nan}, "tilt: size: must be above 0, got nan"),
     ],
 )
@@ -249,7 +249,7 @@ def test_tolerances_that_mean_nothing_are_refused(kind, settings, said):
     "tolerances, said",
     [
         ([], "none; name at least one"),
-        ([("shift", (2,))], "shift: no element 2 can deviate; there are 0, 1"),
+        ([("decentre", (2,))], "decentre: no element 2 can deviate; there are 0, 1"),
         ([("radius", (2,))], "radius: no surface 2 can deviate; there are 0, 1, 4, 5"),
         ([("index", (2,))], "index: no surface 2 can deviate; there are 0, 1, 4"),
         ([("tilt", ()), ("tilt", (1,))], "tilt of element 1, x is named twice; remove one"),

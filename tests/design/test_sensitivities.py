@@ -19,13 +19,13 @@ from drt_jax.design.perturbed import Deviation
 
 SINGLET = drt_jax.load_lens("singlet")
 FIELDS = np.radians([[0, 0], [0, 3], [0, -3]])
-ERRORS = [Tolerance("thickness", 0.3, (1,)), Tolerance("shift", 0.4)]
+ERRORS = [Tolerance("thickness", 0.3, (1,)), Tolerance("decentre", 0.4)]
 BOTH = [Tolerance("sensor", 3.0), Tolerance("thickness", 0.5, (0,))]
 
 
 @pytest.fixture(scope="module")
 def singlet():
-    """A singlet with a wrong thickness and a shift, and what evaluates it."""
+    """A singlet with a wrong thickness and a decentre, and what evaluates it."""
     some = PerturbedLens.from_lens(SINGLET, jnp.array([5.0, 6.0, 6.0]), ERRORS)
     variables = Variables.from_lens(some.lens, ["sensor"])
     scene = Scene.radians(FIELDS, np.inf, [0.5875618])
@@ -171,7 +171,7 @@ def test_inverse_sensitivity_keeps_the_drop(singlet):
     kept = design.inverse_sensitivity(problem, some, "focus", drop)
     table = design.sensitivity(problem, kept)
     assert np.max(table.growth) == pytest.approx(drop, rel=1e-3)
-    assert float(kept.sizes[1]) == float(kept.sizes[2])  # x and y of one shift
+    assert float(kept.sizes[1]) == float(kept.sizes[2])  # x and y of one decentre
     nominal, _ = focused(*singlet, [0.0, 0.0, 0.0])
     spots = [focused(*singlet, [0.0, *row])[0] for row in float(kept.sizes[1]) * np.eye(2)]
     assert max(spots) - nominal == pytest.approx(drop, rel=1e-3)
@@ -202,7 +202,7 @@ def test_a_lens_that_fails_without_errors_is_refused(singlet):
 
 def some_table():
     """A table of two errors."""
-    deviations = Deviation("thickness", 1, 0), Deviation("shift", 0, 1)
+    deviations = Deviation("thickness", 1, 0), Deviation("decentre", 0, 1)
     after = np.array([[1e-4, -1e-4], [2e-3, np.inf]])
     arrays = np.array([0.3, 0.4]), after, after, np.array([[[0.1], [-0.2]], [[0.0], [0.0]]])
     pairs = (("sensor", "mm"),)
@@ -215,7 +215,7 @@ def test_a_table_is_read_worst_first(tmp_path):
     first, heads, worst, other = str(table).splitlines()
     assert first == "spot: 5 um without errors; changes by rays"
     assert heads.split("  ")[0] == "error" and heads.endswith("after + (um)  sensor (mm)")
-    assert " ".join(worst.split()) == "shift of element 0, y 0.4 mm +2 fails +2 fails 0"
+    assert " ".join(worst.split()) == "decentre of element 0, y 0.4 mm +2 fails +2 fails 0"
     assert other.split()[-3:] == ["+0.1", "-0.1", "0.2"]
     assert len(table.worst(1).sizes) == 1
     table.csv(tmp_path / "table.csv")

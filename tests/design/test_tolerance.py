@@ -22,7 +22,7 @@ FIELDS = np.radians([[0, 0], [0, 3], [0, -3], [3, 0], [-2, 1]])
 COLOURS = [0.4861327, 0.6562725]
 SIZES = {
     **{"radius": 1.0, "wedge": 6.0, "thickness": 0.3, "index": 2e-3, "abbe": 1.0},
-    **{"shift": 0.4, "tilt": 30.0},
+    **{"decentre": 0.4, "tilt": 30.0},
 }
 ALL = [Tolerance(kind, size) for kind, size in SIZES.items()]
 
@@ -287,7 +287,7 @@ def test_nothing_drawn_is_worse_than_the_worst_case(singlet, predicted):
 
 @pytest.mark.parametrize("normal", [False, True])
 def test_errors_are_drawn_within_circles(normal):
-    some = perturbed(Tolerance("shift", 1.0), Tolerance("radius", 1.0), Tolerance("tilt", 1.0))
+    some = perturbed(Tolerance("decentre", 1.0), Tolerance("radius", 1.0), Tolerance("tilt", 1.0))
     off = design.draw_perturbations(some, 100_000, 0, normal)
     for part in some.parts:
         assert 0.99 < np.max(np.linalg.norm(off[:, part], axis=1)) <= 1

@@ -34,7 +34,7 @@ ZOOM = {
 ERRORS = [
     Tolerance("radius", 1.0, (0,)),
     Tolerance("thickness", 0.2, (1,), own=True),
-    Tolerance("shift", 0.1, (1,)),
+    Tolerance("decentre", 0.1, (1,)),
 ]
 WEIGHTS = np.array([0.5, 1.5]) / 2
 
@@ -103,8 +103,8 @@ def test_errors_are_common_or_of_one_configuration():
         "radius of surface 0",
         "thickness of surface 1 of configuration 0",
         "thickness of surface 1 of configuration 1",
-        "shift of element 1, x",
-        "shift of element 1, y",
+        "decentre of element 1, x",
+        "decentre of element 1, y",
     ]
     assert [len(part) for part in some.parts] == [1, 1, 1, 2]
     one, two = some.lenses_of(jnp.array([1.0, 0.5, -1.0, 0.0, 1.0]))

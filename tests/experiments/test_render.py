@@ -6,8 +6,13 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from drt_jax import LensError, focal_length
 from experiments import _command, render as experiment
+from experiments.runs.config import load_config
 
+from .test_experiments import ROOT
+
+SETTINGS = ROOT / "configs/render.yaml"
 SMALL = ("nodes=2", "kernel=9", "model=gaussian", "scene.lens=cooke_triplet")
 
 
@@ -21,6 +26,19 @@ def photo(tmp_path):
     path = tmp_path / "photo 1.png"
     Image.fromarray(np.full((30, 40), 128, np.uint8)).save(path)
     return path
+
+
+def test_a_zoom_takes_its_photograph_in_any_configuration():
+    """The focal lengths are those of the patent; a configuration that is not there is named."""
+    zoom, key = "configs/design/lenses/us5568323.zmx", "scene.configuration"
+    words = f"scene.lens={ROOT / zoom}"
+    for number, focal in ((1, 28.98), (2, 49.99), (3, 68.0)):
+        config = load_config(experiment.Config, SETTINGS, [words, f"{key}={number}"])
+        found = focal_length(config.scene.load(), 0.5876)
+        np.testing.assert_allclose(found, focal, rtol=1e-3)
+    config = load_config(experiment.Config, SETTINGS, [words, f"{key}=4"])
+    with pytest.raises(LensError, match="no configuration 4; the file has 3"):
+        config.scene.load()
 
 
 @pytest.mark.slow

@@ -202,7 +202,7 @@ def test_a_constant_index_is_a_glass_of_every_file(kind, tmp_path):
 
 def test_a_model_glass_of_another_dispersion_is_a_private_glass(tmp_path):
     """The same indices at F, d, C; elsewhere no more off than is said."""
-    lens = singlet(nd=1.6204, vd=60.3, partial=0.02)
+    lens = singlet(nd=1.6204, vd=60.3, dPgF=0.02)
     with pytest.warns(UserWarning, match="0.365 to 1.014 um they differ by .* at most") as said:
         save_lens(lens, tmp_path / "own.seq")
     again = load_lens(tmp_path / "own.seq")
@@ -221,7 +221,7 @@ def test_model_glasses_survive_conversions(kind, tmp_path):
     for one, two in (("one.zmx", f"two{kind}"), (f"two{kind}", "three.zmx")):
         save_lens(load_lens(tmp_path / one), tmp_path / two)
     again = load_lens(tmp_path / "three.zmx").dispersion
-    assert again.partial is None
+    assert again.dPgF is None
     np.testing.assert_allclose(again.model[1], [1.6204, 60.3], rtol=1e-14)
 
 

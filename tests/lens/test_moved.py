@@ -49,7 +49,7 @@ def held(gradient):
     model = gradient.dispersion.model
     rest = [] if model is None else [model[0], *model[2:]]  # medium 1 alone is a model glass
     order = [] if gradient.phase is None else [gradient.phase.order]
-    constants = dataclasses.replace(gradient.dispersion, model=None, partial=None)
+    constants = dataclasses.replace(gradient.dispersion, model=None, dPgF=None)
     return [*jax.tree.leaves(constants), *rest, *order]
 
 

@@ -8,7 +8,11 @@ from drt_jax.design.perturbed import Deviation
 
 
 def test_bars_are_the_worse_signs_largest_first():
-    deviations = Deviation("thickness", 1, 0), Deviation("shift", 0, 1), Deviation("radius", 2, 0)
+    deviations = (
+        Deviation("thickness", 1, 0),
+        Deviation("decentre", 0, 1),
+        Deviation("radius", 2, 0),
+    )
     before = 1e-3 * np.array([[1.0, -1.0], [3.0, 3.0], [90.0, 80.0]])
     after = 1e-3 * np.array([[1.0, -1.0], [2.0, 3.0], [np.inf, 1.0]])
     arrays = np.array([0.3, 0.4, 0.1]), before, after, np.zeros((3, 2, 0))
@@ -18,7 +22,9 @@ def test_bars_are_the_worse_signs_largest_first():
     held, bars = ([bar.get_width() for bar in group] for group in axes.containers)
     assert bars == pytest.approx([6, 3, 1]) and held == pytest.approx([6, 3, 1])
     names = [tick.get_text() for tick in axes.get_yticklabels()]
-    assert names[0] == "radius of surface 2: 0.1 %" and names[1] == "shift of element 0, y: 0.4 mm"
+    assert (
+        names[0] == "radius of surface 2: 0.1 %" and names[1] == "decentre of element 0, y: 0.4 mm"
+    )
     assert axes.get_xlabel() == "spot: worse by (um)"
 
 
