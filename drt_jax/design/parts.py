@@ -152,7 +152,7 @@ def _finite(lens: Lens) -> list[int]:
     return np.flatnonzero(np.isfinite(np.asarray(lens.semi_diameter)[:-1])).tolist()
 
 
-_NO_COEFFICIENTS = "the lens has none; write them into its prescription, zeros too"
+_NO_COEFFICIENTS = "the lens has none; add some that are 0, as with_asphere does"
 _NO_PHASE = "the lens has none; write one into its prescription, zeros too"
 _NO_MODEL = "the lens has no model glass; write nd and vd into its prescription"
 _NO_GAP = "the lens has one surface; its distance to the sensor is the kind sensor"
