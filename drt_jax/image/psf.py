@@ -195,7 +195,7 @@ def chosen_psf(
             pairs = ((beam, w) for beam in beams for w in range(waves.size))
             return max(_misfit(b, waves, w, pixels.side, rounded, degree) for b, w in pairs)
 
-        # The fit may take half of the tolerance; what it leaves is for the cells.
+        # Half of the tolerance is for the error of the fit, the rest for the grid of cells.
         ((degree, beams),), error = refine(fits(), misfit, tolerance / 2, together=1)
         if error > tolerance / 2:
             warn(
