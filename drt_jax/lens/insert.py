@@ -1,7 +1,7 @@
 """Surfaces, elements and plates put into a lens and taken out, another stop, aspheric terms.
 
-Stop, apertures, phases, tilts and elements move with their surfaces. Numbers of surfaces count from 0
-in the lens that is given. Numbers may be traced, except where an error says otherwise.
+Stop, apertures, phases, tilts and elements move with their surfaces. Numbers of surfaces count
+from 0 in the lens that is given. Numbers may be traced, except where an error says otherwise.
 """
 
 import dataclasses
