@@ -386,7 +386,7 @@ def _shared(problems: Sequence[Problem], index: Sequence[np.ndarray], count: int
                 f"{at:g} in {number}; give it one number, or name it in own",
             )
         for name, is_empty in zip(own.names, low[where] >= high[where]):
-            require(not is_empty, f"variables: {name}: its bounds exclude each other; widen one")
+            require(not is_empty, f"variables: {name}: its bounds have no common range; widen one")
         steps = scale[where]
         rows = jnp.asarray([low[where] / steps, high[where] / steps, steps], own.low.dtype)
         own = dataclasses.replace(own, low=rows[0], high=rows[1], scale=rows[2])

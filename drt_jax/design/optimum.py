@@ -204,7 +204,7 @@ def optimise(
             break
     require(
         jnp.isfinite(search.evaluation.overlap),
-        "optimise: the start cannot be judged: no ray of a field passes, or a number is not "
+        "optimise: the start cannot be evaluated: no ray of a field passes, or a number is not "
         "finite; begin with weaker curvatures or a smaller stop",
     )
     why = _why(tried, search, target_merit)

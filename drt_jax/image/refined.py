@@ -44,8 +44,8 @@ def require_known(tree: Any, what: str, function: str) -> Any:
     known = known_values(tree)
     if known is None:
         raise ValueError(
-            f"inside jax.jit or jax.vmap {what} cannot follow from a tolerance: make the sampling "
-            f"outside and pass it on, sampling=drt_jax.converge(drt_jax.{function}, ...)"
+            f"inside jax.jit or jax.vmap {what} cannot be chosen for a tolerance: make the "
+            f"sampling outside and pass it on, sampling=drt_jax.converge(drt_jax.{function}, ...)"
         )
     return known
 

@@ -200,7 +200,7 @@ def light_rule(lens: Lens, scene: Scene, order: int = _ORDER) -> Gauss | Clipped
     known = known_values((lens, scene))
     if known is None:
         raise ValueError(
-            "inside jax.jit or jax.vmap the rays cannot follow from what is clipped: make the rule "
+            "inside jax.jit or jax.vmap the rule cannot depend on what is clipped: make the rule "
             "outside and pass it on, sampling=drt_jax.converge(drt_jax.spot_diagram, lens, scene), "
             "or name one, such as sampling=drt_jax.Gauss(12, 'bilateral')"
         )

@@ -270,7 +270,7 @@ class Setup:
             except ValueError as error:
                 raise ConfigError(f"field_deg: {error}") from error
             worst = float(np.max(drt_jax.psf(*given, sampling=model).outside))
-        lost = f"{100 * worst:.0f} % of the light of the spoilt lens falls beside a kernel"
+        lost = f"{100 * worst:.0f} % of the light of the spoilt lens falls outside a kernel"
         remedy = "give a larger one, larger pixels, or spoil the lens less"
         _common.require(worst <= _LOST, f"camera.kernel: {lost} of {size} pixels: {remedy}")
         return model
