@@ -114,9 +114,9 @@ def _seidel(
 def third_order(lens: Lens, scene: Scene) -> ThirdOrder:
     """Third-order aberrations of each surface; `.total` adds them up.
 
-    Conics and the r^2 and r^4 terms of aspheres count. Odd powers of r have no place in this theory
-    and are neglected. Transverse aberrations are 0 for an image at infinity, and colour is 0 for
-    one wavelength.
+    Conics and the r^2 and r^4 terms of aspheres are included. The theory does not cover odd powers
+    of r, which are neglected. Transverse aberrations are 0 for an image at infinity, and colour is
+    0 for one wavelength.
 
     lens: the lens.
     scene: the edge of the field, along y, and wavelengths.
