@@ -161,7 +161,12 @@ def step(function: Function, search: Search, low: Array, high: Array) -> Search:
 
 
 def _tried(function: Function, search: Search, low: Array, high: Array) -> Search:
-    """The state after one trial, with a new Jacobian if the trial is accepted."""
+    """The state after one trial.
+
+    `jax.linearize` gives the residuals of the trial and their linear map. Only if the trial is
+    accepted is this map evaluated for the N unit vectors, which gives the Jacobian; otherwise the
+    state keeps the old one, with a larger damping.
+    """
 
     def residuals_of(vector: Array) -> tuple[Array, Evaluation]:
         values = function(vector)

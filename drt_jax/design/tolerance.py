@@ -290,8 +290,13 @@ def predict(problem: AnyProblem, perturbed: PerturbedLens, compensator: Given) -
 
 @partial(jit, wanted=ONCE)
 def _predict(problem: AnyProblem, perturbed: PerturbedLens, assembly: Assembly) -> Predicted:
-    """`predict` with the solver of the problem: J from one linearised trace, Hessians by forward
-    over reverse mode. Second derivatives of a whole trace are large to compile and run once.
+    """`predict` with the solver of the problem.
+
+    With z = (p, m), deviations and adjustments: J, the derivatives of the residuals by z, comes
+    from one linearised trace; the Hessian H of q by z, and the rows of the Hessian of S by m, come
+    from forward over reverse mode. The free adjustments follow p by dm/dp = -S_mm^-1 S_mp. With
+    D = (1, dm/dp) the model in p has the gradient D g and the Hessian D H D^T. Second derivatives
+    of a whole trace are large programs, which run once, so they are mapped one by one.
     """
     moves = jax.lax.stop_gradient(assembly.moves(problem, perturbed.lenses))
     shares = shares_of(problem)

@@ -302,7 +302,11 @@ def _first(record: Record, lens: Lens) -> tuple[FirstOrder, float, list[float]]:
 
 
 def _opened(record: Record, lens: Lens) -> Lens:
-    """The lens with its stop as wide as the aperture requires in paraxial optics."""
+    """The lens with its stop as wide as the aperture requires in paraxial optics.
+
+    Each kind of aperture gives the radius `wide` of the entrance pupil, mm. The stop is scaled by
+    the ratio of this radius to that of the present entrance pupil.
+    """
     use, semi = record.use, float(lens.semi_diameter[lens.stop])
     value = float(use.aperture or 0)
     first, _, (front, last) = _first(record, lens)

@@ -210,8 +210,14 @@ def _distortion(
     calibrated: bool,
     afocal: bool,
 ) -> Distortion:
-    """`distortion` from chief rays of fields (F + 1, 2), the axis first, and scale (W, 2, 2), mm;
-    None for that of rays near the axis."""
+    """`distortion` from chief rays of fields (F + 1, 2), the axis first.
+
+    The ideal image of a field is scale t from the image of the axis, where t is tan(field), or the
+    field itself for the mapping "angle". A calibrated scale is multiplied by the least-squares
+    factor sum(real . ideal) / sum(ideal . ideal).
+
+    scale: (W, 2, 2), mm; None for the derivative of the hits by the field on the axis.
+    """
     scale = found.by_field[0] if scale is None else scale
     whole = found.whole[1:] & found.whole[:1]
     place = jnp.tan(fields[1:])

@@ -157,7 +157,8 @@ def kernel_grid(lens: Lens, wavelengths: Numbers, sampling: GridMethod) -> Kerne
 
 @functools.partial(jit, wanted=LARGE)
 def _kernel_grid(lens: Lens, method: GridMethod, wavelengths: Array) -> KernelGrid:
-    """`kernel_grid` of arrays: traces the unique nodes, then mirrors them."""
+    """`kernel_grid` of arrays. Only the unique nodes are traced; every node of the grid is then a
+    copy of one of them, whose x and y are swapped or mirrored, see `unique_nodes`."""
     nodes, index, turned = unique_nodes(method.half, method.symmetry)
     tangents = jnp.asarray(nodes, method.step.dtype) * method.step
 

@@ -58,6 +58,9 @@ _WIDEST = 11.4
 def _strip(maps: Maps, method: RenderMethod, picture: Array, row: Array, lit: bool) -> Array:
     """A row of tiles of one distance.
 
+    The picture is warped to the sensor, by cubic convolution at the interpolated sources, blurred
+    with the kernels of the tiles, and multiplied with the relative light.
+
     maps: maps of one distance.
     method: from `render_method`.
     picture: (H, W, C), in the dtype of `maps`.

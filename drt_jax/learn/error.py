@@ -48,7 +48,12 @@ def mean_error(restore: Restore | None, weights: Any, images: Array, truth: Arra
 
 
 def _total_error(restore: Restore) -> Callable[[Any, Array, Array], Array]:
-    """(weights, images, truth) -> sum of the absolute errors, (1,); one of each device."""
+    """(weights, images, truth) -> sum of the absolute errors, (1,); one of each device.
+
+    A custom JVP computes the error and all its derivatives together, for one group of images after
+    the other in a `lax.scan`, and then multiplies the derivatives with the tangents. So only the
+    features of one group are in memory, also in reverse mode.
+    """
     if isinstance(restore, Shared):
         return dataclasses.replace(restore, function=_total_error(restore.function))
 
@@ -76,7 +81,7 @@ def _total_error(restore: Restore) -> Callable[[Any, Array, Array], Array]:
     def total_jvp(primals: Any, tangents: Any) -> tuple[Array, Array]:
         value, found = by_groups(*primals)
         pairs = zip(jax.tree.leaves(found), jax.tree.leaves(tangents), strict=True)
-        # What does not move costs nothing: XLA drops its slopes.
+        # Derivatives by an argument without a tangent are not used, so XLA does not compute them.
         moved = (jnp.sum(s * t) for s, t in pairs if not isinstance(t, SymbolicZero))
         return value[None], sum(moved, jnp.zeros_like(value)).astype(value.dtype)[None]
 

@@ -141,7 +141,13 @@ def third_order(lens: Lens, scene: Scene) -> ThirdOrder:
 
 
 def _third_order(lens: Lens, scene: Scene) -> ThirdOrder:
-    """`third_order` of one object point; 0 where the lens is tilted or the field is not along y."""
+    """`third_order` of one object point; infinite if the lens is tilted or the field not along y.
+
+    With h = 1 / (2 n' u') of the marginal ray at the image, the Seidel sums give the transverse
+    aberrations h S1, 3 h S2, h (3 S3 + S4), h (S3 + S4), h S4 and h S5. The colour of a surface is
+    2 h A y D(dn / n), with the invariant A of the marginal ray (axial) or B of the chief ray
+    (lateral), and dn between the shortest and the longest wavelength.
+    """
     moves = lens.decentre, lens.tilt, lens.elements and (lens.elements.shift, lens.elements.tilt)
     system, vergence = paraxial_system(lens, scene.wavelengths), scene.vergence
     bent = jnp.any(jnp.array([jnp.any(move != 0) for move in jax.tree.leaves(moves)], bool))
