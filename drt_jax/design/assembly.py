@@ -162,7 +162,7 @@ class Assembly:
         return safe_sqrt(jnp.maximum(measure, 0)) if self.of_squares else jnp.asarray(measure)
 
     def of_each(self, moves: Array, count: int) -> list[Array]:
-        """Of adjustments of the sensor (C,), those of each of `count` configurations."""
+        """Splits adjustments of the sensor (C,) into a part for each of `count` configurations."""
         if self.sensor == "common focus":
             return [moves] * count
         return [*moves.reshape(count, COUNTS[self.sensor])]

@@ -51,7 +51,7 @@ def insertions(
     lens: a minimum.
     problem_of: returns the problem of a lens with two more surfaces. Its variables should have all
         curvatures, and thicknesses with a lower bound.
-    glass: of the new elements; None: that of the surface beside them.
+    glass: glass of the new elements; None for the glass of the surface at which they are inserted.
     thickness: of the meniscus at the start, and its distance from the surface, mm.
     bend: change of c2 at the start, relative to the largest curvature of the lens.
     max_steps: as in `optimise`.

@@ -60,8 +60,8 @@ class Operand:
     low, high: limits instead of a target, in the unit of the values.
     weight: factor of the difference from the target, or of the violation of a limit; 0 turns the
         operand off.
-    fields, wavelengths, distances, surfaces: numbers of those of the problem or lens, counted from
-        0; () for all.
+    fields, wavelengths, distances, surfaces: indices of the selected ones in the problem or lens,
+        from 0; () for all.
     vignetting: for spots, wavefronts and functions. False counts clipped rays as if they passed, so
         that clipping light does not lower the merit.
     at: of an mtf, the frequency on the sensor, cycles/mm; of encircled_energy, the radius, mm.

@@ -97,7 +97,7 @@ def monte_carlo(
     The result does not depend on threads, tiles or devices. Where aiming misses a ray, the full ray
     search decides whether the ray exists.
 
-    problem: gives the fields, wavelengths and pupil rule; `Configurations` those of several.
+    problem: gives the fields, wavelengths and pupil rule; or `Configurations`, for several.
     perturbed: the lens and its deviations.
     perturbation: (K, P), deviations in units of their largest.
     compensator: as in `as_built`.

@@ -218,7 +218,7 @@ class Variables:
         """Makes the variables of a lens.
 
         lens: the lens at the start.
-        vary: variables; the name of a kind stands for all variables of that kind.
+        vary: variables; the name of a kind alone means all variables of that kind.
         ties: numbers that follow a variable, or a number that does not change.
         solves: conditions that hold exactly.
 

@@ -54,8 +54,8 @@ class FieldCurvature(NamedTuple):
     """Foci of narrow pencils about the chief rays, (..., W), mm along the z axis of the sensor,
     from where the chief ray meets it; inf for none.
 
-    tangential: of rays that cross the stop beside its centre in the direction of the field (y, for
-        the axis).
+    tangential: of rays whose stop points are displaced from the centre along the field (y, for the
+        axis).
     sagittal: of rays that cross it at right angles to that.
     """
 
@@ -124,7 +124,7 @@ def chief_ray_angle(lens: Lens, scene: Scene) -> Array:
 
 
 def lateral_colour(lens: Lens, scene: Scene, reference: int | None = None) -> Array:
-    """Hits of the chief rays on the sensor, less those of a reference wavelength.
+    """Hits of the chief rays on the sensor, minus the hits in a reference wavelength.
 
     lens, scene: as in `field_curvature`.
     reference: index of the reference wavelength; None: the middle one, W // 2.

@@ -64,7 +64,7 @@ class DepthMoments:
 
 
 def depth_moments(lens: Lens, scene: Scene, tolerance: float | None = None) -> DepthMoments:
-    """Moments for every sensor position and every distance between those of a scene.
+    """Moments for every sensor position and every distance within the range of a scene.
 
     lens: the lens.
     scene: one field at the nearest and the farthest distance, as of `Scene.point`.

@@ -229,7 +229,7 @@ def grid_method(
     """Chooses the settings of `kernel_grid`. All arguments are known numbers.
 
     lens: the lens.
-    scene: its largest angles along x and y are those of the grid; its distances, as of
+    scene: its largest angles along x and y are the extent of the grid; its distances, as of
         `Scene.grid`, are equidistant in 1 / distance, rising or falling.
     pixel: side of a pixel, mm.
     size: number of pixels along a side of a kernel, odd; by default it extends to 4.5 standard

@@ -96,7 +96,7 @@ def transfer(
 
 
 class Plan(NamedTuple):
-    """What a sampling asks for.
+    """A sampling in full.
 
     kind: "waves" or "rays".
     rule: rays and polynomials of the beams.

@@ -100,7 +100,7 @@ def at_temperature(
     Radii, conics, aspheric and diffractive terms, semi-diameters and apertures change with their
     surface, thicknesses of glass with the glass. An air space changes by its mount between the
     semi-diameters of its two surfaces (at the vertex, where a surface has none), decentres and
-    pivots by the mount. A wavelength stands for the same light at all temperatures. Names of
+    pivots by the mount. A wavelength means the same light at all temperatures. Names of
     glasses get the temperature, where it is known.
 
     Differentiable by all numbers, also in `jit` and `vmap`.
