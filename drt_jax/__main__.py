@@ -1,6 +1,6 @@
-"""`python -m drt_jax show my_lens.yaml`: what a lens is, before anything is done with it; `convert`
-writes a lens file in the format of another program; `glass N-BK7`: what a glass is; `check`:
-whether this machine computes what it should."""
+"""Command line of the package, `python -m drt_jax`: `show my_lens.yaml` analyses a lens; `convert`
+writes a lens file in another format; `glass N-BK7` prints the data of a glass; `check` compares
+results on this machine with reference values."""
 
 import argparse
 import contextlib
@@ -96,8 +96,8 @@ def _warnings_on_stdout() -> Iterator[None]:
 def set_up() -> None:
     """Changes settings that a library must not change.
 
-    It enables float64, keeps compiled programs if there is a folder for them, and looks for garbage
-    less often: tracing makes many objects that stay, and the search took a tenth of a command.
+    It enables float64, keeps compiled programs if there is a folder for them, and makes garbage
+    collection rarer: tracing makes many objects that stay, and collection took a tenth of the time.
     """
     gc.set_threshold(200_000, 20, 20)
     jax.config.update("jax_enable_x64", True)

@@ -95,7 +95,7 @@ def require_one_of(
 
 
 def nearest(value: object, known: Iterable[str]) -> str:
-    """What a message adds where a word looks like one that is known, such as "; did you mean
+    """End of a message about an unknown word that resembles a known one, such as "; did you mean
     'spot'?"."""
     close = difflib.get_close_matches(str(value)[:40].lower().replace("-", "_"), known, n=1)
     return f"; did you mean {close[0]!r}?" if close else ""

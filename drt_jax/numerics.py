@@ -1,8 +1,8 @@
-"""Functions that stay finite, with finite derivatives, where the plain ones do not.
+"""Functions that stay finite, with finite derivatives, where the ordinary ones do not.
 
-Each is written with a double `where`: the dangerous operation only sees a harmless argument, so
-that neither its value nor its derivative can become NaN. Nothing is added to a denominator, so that
-ordinary values are not biased.
+Each is written with a double `where`: the first replaces arguments for which the operation is not
+finite, the second replaces its result there. So neither value nor derivative can become NaN.
+Nothing is added to a denominator, so that ordinary values are not biased.
 """
 
 import dataclasses
@@ -96,8 +96,8 @@ def known_values(tree: Any) -> Any:
     """`tree` with its numbers, also while it is being differentiated; None for tracers of `jit` or
     `vmap`.
 
-    What follows from a scene, such as how many rays it needs, is not differentiated, but it must be
-    decided in an eager `jax.grad`, too: there `stop_gradient` returns the values.
+    Choices that depend on a scene, such as the number of rays, are not differentiated, but they
+    must also be made in an eager `jax.grad`: there `stop_gradient` returns the values.
     """
     values = still(tree)
     return values if concrete(values) else None

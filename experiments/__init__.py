@@ -13,13 +13,14 @@ __path__ += [
     str(pathlib.Path(__file__).parent / name)
     for name in ("paper", "trust", "speed", "designing", "imaging", "together")
 ]
-# What is left if the program ends now, as text; `_command` sets it.
+# What the run folder holds if the program ends now, as text; `_command` sets it.
 left: Callable[[], str] = lambda: "nothing was begun"  # noqa: E731
 
 
 def _stop(number: int, frame: Any) -> None:
-    """Ctrl-C in a program: says what is left, and ends. Not an exception, which could rise inside
-    any import, and gets lost in a finalizer; written files are whole at any moment."""
+    """Handler of Ctrl-C: prints what the run folder holds, and ends the process. It raises no
+    exception, because one could occur inside any import or get lost in a finalizer; written files
+    are complete at any moment."""
     with contextlib.suppress(Exception):
         sys.stdout.flush()
         os.write(2, f"\nstopped; {left()}\n".encode())

@@ -25,8 +25,8 @@ _OURS = (pathlib.Path(drt_jax.__file__).parent, pathlib.Path(__file__).parent)
 
 
 def _left(folder: pathlib.Path | None) -> tuple[str, str]:
-    """What is left in a run folder if the command ends now, and how to go on, as text; "" for no
-    more. None for a folder that is not known yet."""
+    """What a run folder holds if the command ends now, and how to continue, as text; "" for
+    nothing. None for a folder that is not known yet."""
     if not (folder and (folder / "config.yaml").is_file()):
         return "nothing was begun", ""
     if (folder / "results.json").is_file():

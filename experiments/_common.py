@@ -142,8 +142,8 @@ def read_results(folder: pathlib.Path) -> dict[str, Any]:
 
 
 def one_machine(results: dict[str, Any]) -> str:
-    """The machine of results, as a line of text. ConfigError if they are of several: their times
-    do not belong in one table."""
+    """The machine of results, as a line of text. ConfigError for results of several machines,
+    whose times must not be in one table."""
     kinds = {hardware(record) for record in results["machines"]}
     words = "times of two machines are never in one table: begin the run anew on one of them"
     require(len(kinds) == 1, f"machines: {' and '.join(sorted(kinds))}: {words}")
@@ -245,8 +245,8 @@ def timed(calls: Sequence[Callable[[], Any]], repeats: int) -> list[list[float]]
     """Seconds of each call, in turns, after one call that does not count. Calls above a second are
     made three times.
 
-    The first call of a turn does not count either, because threads of the program before may still
-    spin.
+    The first call of a turn does not count either, because threads of the previous program may
+    still be active.
     """
     times: list[list[float]] = [[] for _ in calls]
     for call in calls:

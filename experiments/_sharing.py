@@ -74,8 +74,8 @@ def leave(message: str, code: int) -> None:
 
 @contextlib.contextmanager
 def own_folder(folder: pathlib.Path, resume: bool) -> Iterator[pathlib.Path]:
-    """The folder that this process works in: of the run for the first process; for any other a copy
-    that vanishes with it, and no word on the terminal."""
+    """The folder that this process works in: for the first process the folder of the run; for any
+    other a temporary copy, and its output is suppressed."""
     several, first = jax.process_count() > 1, jax.process_index() == 0
     with contextlib.ExitStack() as stack:
         own = folder

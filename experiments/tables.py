@@ -36,8 +36,8 @@ def all_tables() -> dict[str, str]:
 
 
 def filled(text: str, tables: dict[str, str]) -> str:
-    """A page with its blocks replaced. Those of a GPU may be missing, and stay as they are;
-    ConfigError for another table that is not known."""
+    """A page with its blocks replaced. Blocks for GPU results without results stay as they are;
+    ConfigError for another unknown table."""
 
     def block(found: re.Match) -> str:
         name = found[2]

@@ -1,5 +1,5 @@
-"""`drt-jax check`: whether this machine computes what other programs and closed forms say.
+"""`drt-jax check`: compares results on this machine with other programs and closed forms.
 
-`scenes` computes, `truth` has the numbers that must come out, `run` compares and describes the
+`scenes` computes, `truth` has the reference values, `run` compares and describes the
 machine. Command and printing are in `drt_jax.__main__`.
 """

@@ -1,4 +1,4 @@
-"""`python -m drt_jax check`: runs the scenes, and says on which machine."""
+"""`python -m drt_jax check`: runs the scenes and describes the machine."""
 
 import argparse
 import concurrent.futures
@@ -26,7 +26,7 @@ _AT_ONCE = 2  # scenes: XLA compiles a program on one core
 
 @dataclasses.dataclass(frozen=True)
 class Row:
-    """What came of a scene.
+    """Result of a scene.
 
     name: of the scene.
     error: largest error, in the unit of its truth; None if there is none.
@@ -43,7 +43,7 @@ class Row:
 
     @property
     def right(self) -> bool:
-        """True if the numbers came out, within the error that is allowed."""
+        """True if all errors are within the allowed error."""
         return self.error is not None and self.error <= TRUTHS[self.name].allowed
 
 
@@ -169,7 +169,7 @@ def output(options: argparse.Namespace, say: Callable[[str], None]) -> Iterator[
 
 
 def report(found: list[Row], about: dict[str, str], seconds: float) -> dict[str, Any]:
-    """All of a run, for JSON."""
+    """The whole result of a run, for JSON."""
     every = []
     for row in found:
         truth = TRUTHS[row.name]._asdict()

@@ -1,6 +1,6 @@
-"""What the scenes of `drt-jax check` must give, and who says so.
+"""Reference values of the scenes of `drt-jax check`, and their sources.
 
-No number is a former answer of this package. Those of other programs are facts of their listings;
+No number was computed by this package. Numbers of other programs are from their listings;
 `tests/check/outside.py` computes the others again, without the package.
 """
 
@@ -8,10 +8,10 @@ from typing import NamedTuple
 
 
 class Truth(NamedTuple):
-    """What one scene must give.
+    """Reference values of one scene.
 
     about: what is compared.
-    source: who says so.
+    source: origin of the values.
     values: the numbers, in `unit`.
     unit: of the values and of the error.
     allowed: largest error that is right.

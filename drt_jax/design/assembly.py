@@ -1,8 +1,8 @@
-"""How lenses are assembled: what is adjusted in each lens as built, and what is measured of it.
+"""How lenses are assembled: the compensators of each lens as built, and its criterion.
 
-Where the sensor alone is adjusted, the rays of one trace tell the best adjustment, see
-`compensation`. Others need rays of every adjusted lens; a few damped Gauss-Newton steps within
-their limits find them.
+If only the sensor is adjusted, the best adjustment follows from the rays of one trace, see
+`compensation`. Other adjustments change the rays, so that every trial is a trace; a few damped
+Gauss-Newton steps within their limits find the best ones.
 """
 
 import dataclasses
@@ -42,19 +42,19 @@ _STEPS = 5  # of Gauss and Newton: an evaluation, and four trials
 @leaves("criterion", "merit", "parts", "held")
 @dataclasses.dataclass(frozen=True)
 class Assembly:
-    """How lenses are assembled, and what is measured of them.
+    """How lenses are assembled: what is adjusted in each lens, and which criterion is measured.
 
     compensator: what is adjusted in each lens. "none"; "focus", the distance of the sensor; "focus
         and tilt", also its tilts about x and y; or tolerances, each of which names parts and the
         largest adjustment in both directions: Tolerance("thickness", 0.3, (4,)) is a spacer,
         Tolerance("decentre", 0.1, (1,)) an element that is centred, Tolerance("sensor", 1) focus.
-        Of several configurations each has its own focus (and tilt), while all share "common focus"
-        and the adjustments of tolerances, except those with `own`.
+        If there are several configurations, each has its own focus (and tilt); "common focus" and
+        the adjustments of tolerances without `own` are the same in all.
     criterion: the figure of merit: an operand, its name, or a function of a lens and its
         `FieldRays`. Its value is the mean of the values of the operand; for residuals such as
-        "spot" and "path_difference" the root of the mean square over the views; of several
-        configurations the same mean, with their weights. Good is what is near the target of the
-        operand.
+        "spot" and "path_difference" the root of the mean square over the views. The mean over
+        several configurations uses their weights. A lens is better if the value is nearer to the
+        target of the operand.
     merit: operand whose squares the adjustments of tolerances minimise. "focus" and "focus and
         tilt" minimise spots.
 
@@ -71,7 +71,7 @@ class Assembly:
 
     @classmethod
     def of(cls, given: "Assembly | Compensator | Sequence[Tolerance]") -> "Assembly":
-        """An assembly that is given, or the usual one with a compensator that is given."""
+        """An assembly: the argument itself, or one with this compensator and default criterion."""
         return given if isinstance(given, Assembly) else cls(given)
 
     def placed(
@@ -162,7 +162,7 @@ class Assembly:
         return safe_sqrt(jnp.maximum(measure, 0)) if self.of_squares else jnp.asarray(measure)
 
     def of_each(self, moves: Array, count: int) -> list[Array]:
-        """Of adjustments of the sensor (C,), those of each of `count` configurations."""
+        """Splits adjustments of the sensor (C,) into a part for each of `count` configurations."""
         if self.sensor == "common focus":
             return [moves] * count
         return [*moves.reshape(count, COUNTS[self.sensor])]
@@ -259,8 +259,7 @@ Given: TypeAlias = Assembly | Compensator | Sequence[Tolerance]
 
 
 def mean_of(problem: AnyProblem, each: Array) -> Array:
-    """Mean () of a number of each configuration (C,), with their weights; what has no weight may be
-    infinite."""
+    """Weighted mean () over the configurations of numbers (C,). A number of weight 0 may be inf."""
     shares = shares_of(problem)
     return jnp.sum(jnp.where(shares > 0, shares * each, 0))
 
@@ -277,7 +276,7 @@ def _focused(lens: Lens, moves: Array) -> Lens:
 
 
 def _operand(given: Operand | OperandName | OperandFunction) -> Operand:
-    """An operand, or that of a name or function; the target of waves is 1."""
+    """The operand itself, or an operand for a name or function; diffraction gets the target 1."""
     if isinstance(given, Operand):
         return given
     of_waves = given in OPERANDS and kind_of(given).of_waves
@@ -290,8 +289,8 @@ def as_built(problem: AnyProblem, lens: Lens | Sequence[Lens], compensator: Give
     Works in `jit`, `vmap` and under differentiation; with tolerances or an `Assembly` of them as
     compensator, the lens must be known, and nothing is differentiated.
 
-    problem: gives the fields, wavelengths and pupil rule; `Configurations` those of several.
-    lens: the lens as built, or that of each configuration.
+    problem: gives the fields, wavelengths and pupil rule; or `Configurations`, for several.
+    lens: the lens as built; for several configurations a sequence of lenses.
     compensator: "none", "focus" (the distance of the sensor), "focus and tilt" (also its tilts
         about x and y), "common focus" of all configurations, tolerances, or an `Assembly`, which
         describes them.

@@ -28,12 +28,12 @@ _SYMMETRIES = ("rotational", "bilateral", "none")  # by the traced part of the p
 class AsBuilt(NamedTuple):
     """A lens as built, after compensation.
 
-    squares: (V,), squared RMS radii of the spots, mm^2; inf where rays fail or no light passes. Of
-        several configurations those of each, one after the other.
+    squares: (V,), squared RMS radii of the spots, mm^2; inf where rays fail or no light passes.
+        Several configurations are concatenated.
     moves: (C,), compensation: the shift of the sensor, mm, then its tilts about x and -y, radians,
         of each configuration; or the adjustments of an `Assembly` in the units of its tolerances.
     value: (), the criterion, see `Assembly`: by default the spot, the root of the mean of the
-        squares, mm. Infinite, away from its target, where rays fail.
+        squares, mm. If rays fail, it is infinite, with the sign that leads away from the target.
     each: (Z,), the criterion of each configuration.
     """
 
@@ -80,7 +80,7 @@ def normal_equations(lens: Lens, rays: FieldRays, compensator: Compensator) -> t
 
 
 def solved(matrix: Array, right: Array) -> Array:
-    """The solution (L,) of normal equations; of no light the right side."""
+    """The solution (L,) of normal equations; the right side, which is 0, if there is no light."""
     if not len(right):
         return right
     lit = matrix[0, 0] > 0
@@ -122,6 +122,6 @@ def check(problem: Problem, lens: Lens, compensator: str) -> None:
         tangents = np.tan(np.asarray(problem.fields, float))
         require(
             np.linalg.matrix_rank(np.c_[np.ones(len(tangents)), tangents]) == 3,
-            "compensator: focus and tilt: the fields lie on a line, about which any tilt is as "
-            "good; add fields beside it",
+            "compensator: focus and tilt: the fields lie on a line, so that the tilt about this "
+            "line is undetermined; add a field off the line",
         )

@@ -40,7 +40,7 @@ class SharedVariables:
     scale: (N,), in the units of the lens.
     start: (N,), the vector of the lenses at the start.
     first: the variables of configuration 0.
-    index: (n,), where these stand in the vector.
+    index: (n,), positions of these in the vector.
 
     Static:
     names: N names, such as "curvature 3" and "thickness 4 of configuration 0".
@@ -78,10 +78,10 @@ class _Alike:
 
     problem: the first of them.
     own: the leaves that differ, each (G, ...).
-    index: (G, n), where the variables of each stand in the vector.
+    index: (G, n), positions of the variables of each problem in the vector.
 
     Static:
-    differ: numbers of these leaves among those of the problem.
+    differ: positions of these leaves in the list of leaves of the problem.
     numbers: G numbers of the configurations.
     """
 
@@ -126,9 +126,9 @@ def _same(one: Any, other: Any) -> bool:
 class Configurations:
     """A design problem of C configurations, for `optimise`, `many_starts` and `grow`.
 
-    Residuals and constraints are those of the configurations, one after the other.
+    Residuals and constraints of the configurations are concatenated.
 
-    groups: the problems, those of one structure together.
+    groups: the problems, grouped by structure.
     variables: the variables of all as one vector.
     weights: (C,), factors of the squares of the residuals of each configuration, with the mean 1.
     """
@@ -331,7 +331,7 @@ def _groups(problems: Sequence[Problem], index: Sequence[np.ndarray]) -> tuple[_
 def _slots(
     problems: Sequence[Problem], own: Sequence[str]
 ) -> tuple[list[np.ndarray], dict[str, int]]:
-    """Where the variables of each problem stand in the vector, and the names of the vector."""
+    """Positions of the variables of each problem in the vector, and the names of the vector."""
     sets = [problem.variables.places for problem in problems]
     words = {own} if isinstance(own, str) else {*own}
     is_own = lambda place: bool({str(place), place.kind} & words)  # noqa: E731
@@ -386,7 +386,7 @@ def _shared(problems: Sequence[Problem], index: Sequence[np.ndarray], count: int
                 f"{at:g} in {number}; give it one number, or name it in own",
             )
         for name, is_empty in zip(own.names, low[where] >= high[where]):
-            require(not is_empty, f"variables: {name}: its bounds exclude each other; widen one")
+            require(not is_empty, f"variables: {name}: its bounds have no common range; widen one")
         steps = scale[where]
         rows = jnp.asarray([low[where] / steps, high[where] / steps, steps], own.low.dtype)
         own = dataclasses.replace(own, low=rows[0], high=rows[1], scale=rows[2])

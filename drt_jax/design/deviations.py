@@ -56,7 +56,7 @@ class Kind(NamedTuple):
     places: function of a lens, the numbers of the surfaces or elements that can have it.
     change: function of a lens and of deviations of this kind, the lens with them.
     most: upper bound of the size, in that unit.
-    why_none: what is said of a lens that has no such places.
+    why_none: end of the error message for a lens without such places.
     """
 
     whole: str

@@ -1,4 +1,4 @@
-"""What a lens that focuses does to the picture: angle of view, breathing and magnification."""
+"""How focusing changes the image: angle of view, breathing and magnification."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -14,14 +14,14 @@ from ..numerics import Numbers
 
 
 class Focusing(NamedTuple):
-    """Picture of each of C configurations.
+    """Angle of view, breathing and magnification of each of C configurations.
 
     angle: (C,), radians, at least 0: half the angle of view, between the axis and the object point
-        whose chief ray meets the sensor at the given height, seen from the paraxial entrance pupil;
-        inf if no chief ray comes there.
-    breathing: (C,), tan(angle) relative to that of the first configuration, less 1: below 0 the
-        picture is magnified, as if the lens became longer; inf if one of the angles is inf, or for
-        a height of 0.
+        whose chief ray meets the sensor at the given height, measured at the paraxial entrance
+        pupil; inf if no chief ray meets this point.
+    breathing: (C,), tan(angle) divided by tan(angle) of the first configuration, minus 1. If it is
+        negative, the angle of view is smaller, as with a longer focal length. It is inf if one of
+        the angles is inf, and for a height of 0.
     magnification: (C,), paraxial, 0 for an object at infinity.
     focal_length: (C,), effective, mm.
     """
@@ -37,9 +37,9 @@ def focusing(
 ) -> Focusing:
     """Angle of view, focus breathing and magnification of a lens in several configurations.
 
-    An angle of a finite object needs a point that it is seen from. Here, and where breathing is
-    measured, this is the entrance pupil of the configuration, the centre of perspective; a field
-    of `Scene` is seen from the first vertex.
+    The angle of a finite object depends on the reference point. Here it is the entrance pupil of
+    the configuration, the centre of perspective, as in measurements of breathing. A field of
+    `Scene` refers to the first vertex.
 
     lenses: C lenses, such as `Configurations.lenses` returns them.
     distances: C distances of the object from the first vertex, mm; may be inf.

@@ -84,11 +84,11 @@ class _Trial(NamedTuple):
 
 
 def ordinary_glass(glass: Glass) -> bool:
-    """Whether a glass is one that its maker lists to be sold today, by its `status`.
+    """Whether the maker of a glass sells it as a regular product today, by its `status`.
 
-    Not so are obsolete and special glasses (on inquiry, for moulding in moulds of one customer),
-    those whose maker gives no status, such as plastics, glasses against radiation (SF6G05), twins
-    of high transmission (N-SF6HT), and glasses whose constants begin above 0.44 um.
+    False for obsolete and special glasses (on inquiry, for moulding in moulds of one customer),
+    for glasses without a status, such as plastics, for radiation-resistant glasses (SF6G05),
+    variants of high transmission (N-SF6HT), and glasses whose constants begin above 0.44 um.
     """
     sold = glass.status in ("standard", "preferred")
     return sold and not _SPECIAL.search(glass.name) and glass.range[0] <= _CLEAR

@@ -1,7 +1,7 @@
 """Published grades of precision of single elements, as data.
 
-Makers publish what they hold at their usual price. None of these charts says how elements are
-mounted: add shifts and tilts of elements, and air spaces, of your own mechanics.
+Makers publish the tolerances that they guarantee at their usual price. None of these charts
+describes the mount: add tolerances for shifts and tilts of elements and for air spaces.
 """
 
 from collections.abc import Mapping
@@ -47,7 +47,7 @@ GRADES: dict[GradeName, Grade] = {
     "precision": Grade(
         {"radius": 0.1, "thickness": 0.05, "index": 5e-4, "abbe": 0.5}, _GLASS
     ),
-    # Of this grade the chart knows each melt; what is left is not said.
+    # For this grade the chart uses the measured index of each melt, and gives no remaining error.
     "high precision": Grade({"radius": 0.01, "thickness": 0.01}, _GLASS),
     "moulded": Grade({"radius": 1.0, "thickness": 0.025, "irregularity": 6 * _RED}, _PLASTIC),
     "moulded precision": Grade(

@@ -1,4 +1,4 @@
-"""One element more: thin meniscuses at all surfaces, and least squares both ways from each."""
+"""One more element: a thin meniscus at each surface, and least squares from both sides of it."""
 
 import dataclasses
 from collections.abc import Callable, Iterator
@@ -15,9 +15,9 @@ from .problem import Problem
 
 
 class Insertion(NamedTuple):
-    """A lens with one element more.
+    """A lens with one more element.
 
-    at: the surface that the meniscus stood at, a number of the lens before.
+    at: surface at which the meniscus was inserted, numbered as in the original lens.
     front: True for a meniscus in front of that surface, False for one behind it.
     way: 1 or -1, the sign of the bending at the start.
     problem, optimum: of the longer lens.
@@ -39,18 +39,19 @@ def insertions(
     max_steps: int = 100,
 ) -> Iterator[Insertion]:
     """Puts a thin meniscus at each surface between glass and air, on the side of the air, and
-    optimises both ways from there.
+    optimises from there with c2, see below, changed in both directions.
 
-    A meniscus that touches a surface of its own shape and glass has no thickness and changes no
-    ray: with c1, c2, c3 the three curvatures, neither does (c, u, u), nor (u, u, c). Two lines of
-    equal merit cross there, so the point is a saddle, from which least squares fall on two sides to
-    different lenses (Bociort and van Turnhout, Opt. Eng. 48, 063001, 2009). A thin meniscus nearby
-    is nearly that.
+    Let the meniscus have the glass of the surface, no thickness, and no distance from it, and let
+    c1, c2, c3 be the curvatures of the three surfaces in order, the original one being c. Then
+    (c, u, u) and (u, u, c) have the rays of the original lens for every u. So two lines of merit
+    equal to that of the lens cross at (c, c, c), and this point is a saddle: least squares from its
+    two sides end at different lenses (Bociort and van Turnhout, Opt. Eng. 48, 063001, 2009). A
+    meniscus with a small thickness and distance is close to this saddle.
 
     lens: a minimum.
-    problem_of: makes the problem of a lens with two surfaces more. Its variables should include all
+    problem_of: returns the problem of a lens with two more surfaces. Its variables should have all
         curvatures, and thicknesses with a lower bound.
-    glass: of the new elements; None: that of the surface beside them.
+    glass: glass of the new elements; None for the glass of the surface at which they are inserted.
     thickness: of the meniscus at the start, and its distance from the surface, mm.
     bend: change of c2 at the start, relative to the largest curvature of the lens.
     max_steps: as in `optimise`.

@@ -29,8 +29,8 @@ _DAMPING, _MOST_DAMPING = 1e-3, 1e16  # at the start, and where a search ends
 _PARTS = (1.0, 0.5, 0.25, 0.1, 0.03)  # fractions of a step of which the model chooses the best
 _SETS = 5  # updates of the active set (bounds and constraints) in one step
 # The merit has settled when the model promises a relative gain below `_COARSE`, or below `_FINE`
-# once constraints are met. A search only converges to its constraints, so it aims `_WITHIN` inside
-# of them, in their own units, in order to meet them.
+# once constraints are met. A search only converges towards its constraints, so each constraint is
+# tightened by `_WITHIN`, in its own unit, in order to be met.
 _COARSE, _FINE, _WITHIN = 1e-5, 1e-13, 1e-9
 _ROUNDS = 30  # largest number of shifts
 
@@ -161,7 +161,12 @@ def step(function: Function, search: Search, low: Array, high: Array) -> Search:
 
 
 def _tried(function: Function, search: Search, low: Array, high: Array) -> Search:
-    """The state after one trial, with a new Jacobian if the trial is accepted."""
+    """The state after one trial.
+
+    `jax.linearize` gives the residuals of the trial and their linear map. Only if the trial is
+    accepted is this map evaluated for the N unit vectors, which gives the Jacobian; otherwise the
+    state keeps the old one, with a larger damping.
+    """
 
     def residuals_of(vector: Array) -> tuple[Array, Evaluation]:
         values = function(vector)

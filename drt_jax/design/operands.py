@@ -60,8 +60,8 @@ class Operand:
     low, high: limits instead of a target, in the unit of the values.
     weight: factor of the difference from the target, or of the violation of a limit; 0 turns the
         operand off.
-    fields, wavelengths, distances, surfaces: numbers of those of the problem or lens, counted from
-        0; () for all.
+    fields, wavelengths, distances, surfaces: indices of the selected ones in the problem or lens,
+        from 0; () for all.
     vignetting: for spots, wavefronts and functions. False counts clipped rays as if they passed, so
         that clipping light does not lower the merit.
     at: of an mtf, the frequency on the sensor, cycles/mm; of encircled_energy, the radius, mm.
@@ -92,21 +92,21 @@ class Operand:
         low = -math.inf if self.low is None else self.low
         high = math.inf if self.high is None else self.high
         if (self.at is None) == bool(known.at):
-            reason = _NEEDED if known.at else "is of mtf and encircled_energy; leave it out"
+            reason = _NEEDED if known.at else "only mtf and encircled_energy have it; leave it out"
             raise ValueError(f"{what}: at: {reason}")
         if not concrete((low, high, self.weight, self.target, self.at)):
             return
         if self.at is not None and not 0 < self.at < math.inf:
             raise ValueError(f"{what}: at: must be above 0 and finite, got {self.at:g}")
         if known.of_waves and not (self.target or self.limits):
-            raise ValueError(f"{what}: target: 0 is no light; give 1 for the best, or limits")
+            raise ValueError(f"{what}: target: 0 means no light; give 1 for the best, or limits")
         require(low != high, f"{what}: low and high are both {low:g}; give it as the target")
         require(low < high, f"{what}: low {low:g} is not below high {high:g}; exchange them")
         size = f"must be above 0, or 0 to leave it out, got {self.weight:g}"
         require(0 <= self.weight < math.inf, f"{what}: weight: {size}")
         if not self.vignetting and not (known.of_spots or callable(self.kind)):
             some = ", ".join(kind for kind, value in OPERANDS.items() if value.of_spots)
-            raise ValueError(f"{what}: vignetting: is of {some}; leave it out")
+            raise ValueError(f"{what}: vignetting: only for {some}; leave it out")
         require(math.isfinite(self.target), f"{what}: target: must be finite, got {self.target:g}")
         if self.target and self.limits:
             raise ValueError(f"{what}: has a target and limits; make two operands of it")

@@ -43,10 +43,10 @@ class Optimum(NamedTuple):
     limits: all limits by name, the largest violation first, each in its own unit.
     ended: why the search ended. "converged": all limits are met, and the linear model predicts a
         relative decrease of at most 1e-6. "target": the target merit is reached. "steps": the steps
-        are used up. "limits": some are not met in the end, as of limits that contradict each other.
-        "stuck": they are met, but no trial is better, for instance because surfaces touch, which a
-        limit such as air_edge prevents; or the limits were met only by the last steps, which the
-        merit did not settle.
+        are used up. "limits": some limits are not met at the end, for instance because they
+        contradict each other. "stuck": all limits are met, but no trial is better, for instance
+        because surfaces touch, which a limit such as air_edge prevents; or only the last steps met
+        the limits, before the merit had settled.
     history: (T, 3), merit, largest violation and number of Jacobians after each trial.
     seconds: time of all trials except the first.
     first: time of the first trial, with compilation if it is needed, s.
@@ -66,8 +66,8 @@ class Optimum(NamedTuple):
     variables: Variables | SharedVariables
 
     def __str__(self) -> str:
-        """Ten lines or so: merit, why it ended, limits that are active or violated, variables with
-        units and those at a bound."""
+        """About ten lines: merit, reason of the end, limits that are active or violated, variables
+        with units, and variables at a bound."""
         times = f"{self.jacobians} Jacobians, {self.first:.1f} + {self.seconds:.1f} s"
         active = [limit for limit in self.limits if limit.excess > -1e-6 * (1 + abs(limit.bound))]
         met = "all met" if self.max_violation <= 0 else f"violated by {self.max_violation:.3g}"
@@ -204,7 +204,7 @@ def optimise(
             break
     require(
         jnp.isfinite(search.evaluation.overlap),
-        "optimise: the start cannot be judged: no ray of a field passes, or a number is not "
+        "optimise: the start cannot be evaluated: no ray of a field passes, or a number is not "
         "finite; begin with weaker curvatures or a smaller stop",
     )
     why = _why(tried, search, target_merit)

@@ -104,7 +104,7 @@ class PerturbedLens:
     ) -> "PerturbedLens":
         """The lens with the deviations that tolerances allow.
 
-        lens: the nominal lens, or those of several configurations, of the same parts.
+        lens: the nominal lens; for several configurations a sequence of lenses with the same parts.
         beam_radius: (S,), mm, for instance that of `Problem.beam_radius` or, the largest of all,
             of `Configurations.beam_radius`.
         tolerances: the tolerances.
@@ -138,8 +138,8 @@ class PerturbedLens:
         return cls(lens, *numbers, tuple(sizes), spans, groups, rest)
 
     def around(self, *lenses: Lens) -> "PerturbedLens":
-        """The same deviations of another nominal lens with the same surfaces, or of those of all
-        configurations. Works in `jit`."""
+        """The same deviations about another nominal lens with the same surfaces; for several
+        configurations about a sequence of lenses. Works in `jit`."""
         first, *others = (_with_parts(lens, self.spans, self.deviations)[0] for lens in lenses)
         return dataclasses.replace(self, lens=first, others=tuple(others))
 
@@ -150,7 +150,7 @@ class PerturbedLens:
 
     @property
     def parts(self) -> list[list[int]]:
-        """Indices of the deviations of each part: one index, or those of the components x and y."""
+        """Indices of the deviations of each part: one index, or two for the components x and y."""
         parts: dict[tuple, list[int]] = {}
         for k, error in enumerate(self.deviations):
             parts.setdefault((*error[:2], error.configuration), []).append(k)

@@ -167,7 +167,7 @@ class Problem:
         return {name: len(getattr(self, name)) for name in names}
 
     def __str__(self) -> str:
-        """Ten lines or so: what is varied, traced and asked for."""
+        """About ten lines: variables, rays and operands."""
         if not concrete(self):
             return repr(self)
         across, up = np.degrees(np.asarray(self.fields)).T

@@ -1,15 +1,16 @@
-"""Steps of a lens that are measured by how far they move its rays.
+"""Ray steps: an optimiser of a lens whose steps are scaled by the displacement of its rays.
 
-Adam moves each number of a lens by its own rate, though only combinations of them change the
-picture. Rays know the combinations without noise. With J, the derivatives of the hits on the sensor
-about the centroid of each object point by the variables, and the gradient g of a loss,
+Adam has a rate for each variable, but the image depends on combinations of variables. The Jacobian
+of the rays gives these combinations without the noise of a batch. Let J be the Jacobian by the
+variables of the hits on the sensor, relative to the centroid of their object point and scaled to
+the mean square, and g the gradient of a loss:
 
     A = J^T J, mm^2 of mean square displacement;  B = A + damping diag(A)
     m <- b1 m + (1 - b1) g,   n <- b2 n + (1 - b2) g^T B^-1 g
-    step = -size B^-1 m / sqrt(n), m and n without their bias,
+    step = -size B^-1 m / sqrt(n), with the bias of m and n removed as in Adam.
 
-moves the rays by `size`, root mean square, if gradients agree, and less if they do not. No rate
-depends on the unit of a variable, on that of the loss, or on the batch.
+If successive gradients agree, the step moves the rays by `size`, root mean square; otherwise by
+less. The step does not depend on the units of the variables and of the loss, nor on the batch size.
 """
 
 import dataclasses
@@ -53,15 +54,17 @@ def cosine(size: float, steps: int, warm: int = 10) -> Callable[[Array], Array]:
 class RaySteps:
     """An optimiser of the vector of a lens, by gradients of any loss.
 
-    spots: problem with the operand "spot": its fields, distances and wavelengths are those whose
-        rays count.
-    limits: problem whose bounds and limits hold, in the metric of the rays, see `within_limits`.
-    size: mm, root mean square over all rays, by which a step moves the hits; or a function of the
-        number of the step, such as `cosine`.
-    share: of the RMS spot, that no step exceeds: a lens whose spots are far smaller than `size`
-        keeps them.
-    damping: of directions that hardly move rays.
-    every: number of steps after which the metric is made anew.
+    spots: problem with the operand "spot"; the metric B uses the rays of its fields, distances and
+        wavelengths.
+    limits: problem whose bounds and limits hold; updates are projected onto them in the metric B,
+        see `within_limits`.
+    size: RMS displacement of the hits by a step, mm; or a function of the number of the step, such
+        as `cosine`.
+    share: largest step as a fraction of the present RMS spot, so that a step does not destroy spots
+        that are far smaller than `size`.
+    damping: relative addition to the diagonal of A; it limits steps in directions that hardly move
+        rays.
+    every: number of steps after which B is renewed.
     b1, b2: decay rates of the means.
     """
 
@@ -91,7 +94,7 @@ class RaySteps:
         slopes, spot = jax.jacfwd(hits, has_aux=True)(vector)
         square = matmul(slopes.T, slopes) / views
         diagonal = jnp.diagonal(square)
-        # A variable that moves no ray stays: it has no gradient either.
+        # The element of a variable that moves no ray only keeps B regular.
         idle = jnp.where(diagonal > 0, self.damping * diagonal, jnp.max(diagonal))
         return square + jnp.diag(idle), spot
 

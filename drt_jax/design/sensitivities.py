@@ -1,4 +1,4 @@
-"""Sensitivity of a lens to each error alone, as a table; and the errors that keep a drop."""
+"""Sensitivity of a lens to each error alone, as a table; and the sizes of errors for a drop."""
 
 import csv
 import dataclasses
@@ -26,17 +26,17 @@ _UNITS = {
 _AT = {"mtf": " at {:g} cycles/mm", "encircled_energy": " within {:g} mm"}
 _FOCUS = (("sensor", "mm"), ("sensor tilt x", "rad"), ("sensor tilt -y", "rad"))
 _TRIALS = 5  # of each size by rays, after the parabola
-_GRID = 400  # sizes at which the parabola is looked at
+_GRID = 400  # sizes at which the parabola is evaluated
 _STEEPEST = 0.5, 4.0  # powers of the size with which a drop grows, at least and at most
 
 
 class Sensitivity(NamedTuple):
-    """What each error alone does to the criterion of an `Assembly`; prints as a table.
+    """Change of the criterion of an `Assembly` by each error alone; prints as a table.
 
     criterion: name of the criterion.
     unit, factor: unit in which the table shows the criterion, and the factor from its own unit.
     nominal: the criterion without errors.
-    target: of the criterion; good is what is near it.
+    target: target of the criterion; a lens is better if its criterion is nearer to it.
     deviations: the P errors.
     sizes: (P,), in the units of `Tolerance`.
     before: (P, 2), change of the criterion at minus and plus the size, with all adjustments held.
@@ -44,7 +44,8 @@ class Sensitivity(NamedTuple):
     moves: (P, 2, C), changes of the adjustments.
     adjustments: C pairs of a name and a unit.
     by: "rays" for traced lenses, "second derivatives" for a prediction.
-    each: (P, 2, Z), `after` in each of several configurations; None of one, and for a prediction.
+    each: (P, 2, Z), `after` for each of several configurations; None for a single one and for a
+        prediction.
     """
 
     criterion: str
@@ -63,8 +64,8 @@ class Sensitivity(NamedTuple):
 
     @property
     def growth(self) -> np.ndarray:
-        """By how much the worse sign of each error (P,) takes the criterion away from its target,
-        after compensation.
+        """Increase (P,) of the distance of the criterion from its target, after compensation, for
+        the worse sign of each error.
         """
         off = abs(self.nominal - self.target)
         return np.max(np.abs(self.nominal + self.after - self.target) - off, axis=1)
@@ -122,14 +123,15 @@ def sensitivity(
     compensator: Given = "focus",
     predicted: Predicted | None = None,
 ) -> Sensitivity:
-    """What each error alone does, at its largest in both directions.
+    """Change of the criterion by each error alone, at plus and minus its size.
 
-    problem: gives the fields, wavelengths and pupil rule; `Configurations` those of several, over
-        which the criterion is the mean. The table has the change of each, of the worse direction.
+    problem: gives the fields, wavelengths and pupil rule; or `Configurations`, over which the
+        criterion is the mean. The table also has the change in each configuration, for the worse
+        sign.
     perturbed: the lens and its errors.
     compensator: as in `as_built`; an `Assembly` has another criterion than spots.
-    predicted: what `predict` has found with the same arguments: the table is then that of second
-        derivatives, and nothing is traced.
+    predicted: result of `predict` for the same arguments; the table is then computed from second
+        derivatives, and no ray is traced.
 
     ValueError as in `as_built`, and for a lens that fails without errors.
     """
@@ -191,19 +193,18 @@ def inverse_sensitivity(
     drop: float,
     most: float = 10.0,
 ) -> PerturbedLens:
-    """The lens with errors of other sizes: each alone takes the criterion by `drop` from its
-    target.
+    """The lens with other sizes of its errors: each alone worsens the criterion by `drop`.
 
     A parabola through three traced lenses gives the size of each error, in the worse direction; a
-    few traced lenses correct it. Components x and y of one part get the smaller size. Read the
-    result by `sensitivity`. For a budget of N parts that add as a root sum of squares, ask for the
-    whole drop divided by N ** 0.5.
+    few traced lenses correct it. Components x and y of one part get the smaller size. Pass the
+    result to `sensitivity` for a table. For a budget of N parts that add as a root sum of squares,
+    use the whole drop divided by N ** 0.5.
 
     problem, perturbed, compensator: as in `sensitivity`.
     drop: allowed change of the criterion after compensation, above 0, in its own unit (mm for
         spots).
-    most: largest factor of the sizes that are given. An error that does less than the drop gets
-        these.
+    most: largest factor by which a size may grow. An error whose change is still below the drop
+        there gets this size.
 
     ValueError as in `as_built`, for a lens that fails without errors, and for a drop or a factor
     that is not above 0.
@@ -256,8 +257,8 @@ def _require_nominal(value: float) -> None:
 
 
 def _parabola_sizes(size: np.ndarray, fell: np.ndarray, top: np.ndarray, drop: float) -> np.ndarray:
-    """Sizes (P, 2) at which errors take the criterion by `drop`, at most `top` (P, 1), from its
-    changes `fell` (P, 2) at sizes (P, 2) to both sides.
+    """Sizes (P, 2), at most `top` (P, 1), at which errors change the criterion by `drop`; from the
+    changes `fell` (P, 2) at sizes (P, 2) of both signs.
 
     The change is a t + b t^2 for an error of the size t, with the sign of a to one side.
     """

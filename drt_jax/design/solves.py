@@ -108,7 +108,7 @@ class Solve:
         require(
             self.kind != "image_angle" or self.surface >= lens.stop,
             f"solves: image_angle: surface {self.surface} lies before the stop, which is number "
-            f"{lens.stop}; give one at it or behind, of {active}",
+            f"{lens.stop}; give the stop or a surface behind it, of {active}",
         )
         return Place("curvature", self.surface, 0)
 
@@ -138,8 +138,8 @@ class Solve:
         if self.focuses:
             require(
                 float(_focus(lens, self.placed(lens))[1]) > 0,
-                f"{what}: there is none: the light behind the lens is parallel, or none arrives; "
-                "leave it out, or begin with another lens",
+                f"{what}: there is no focus: the light behind the lens is parallel, or absent; "
+                "leave it out, or start from another lens",
             )
             scene = Scene.point(0.0, self.distance, self.wavelengths)
             warn_of_focus(lens, checked_scene(lens, scene))
@@ -148,7 +148,7 @@ class Solve:
         if self.value == 0:
             current = self.converted(float(_measure(lens, self)))
             known = current != 0 and math.isfinite(current)
-            require(known, f"{what}: the lens has none to keep; give its value")
+            require(known, f"{what}: the lens has no such value to keep; give one")
             solve = dataclasses.replace(self, value=current)
         target = self.converted(float(solve.value))
         ratio = float(_measure(solve.apply(lens), solve)) / target

@@ -211,7 +211,7 @@ def many_starts(
     compiled = time.perf_counter() - begun
 
     def search(problem: AnyProblem, searches: np.ndarray, steps: int) -> None:
-        """Advances searches, and tells of each tile."""
+        """Advances searches, and calls `callback` after each tile."""
         for _ in advance(problem, searches, steps):
             best.append(float(np.min(rows(alive).score)))
             callback(len(best), max(total, len(best)), best[-1])

@@ -35,7 +35,7 @@ _TILE = 50  # number of lenses in a tile
 _DEVIATION = 0.5  # standard deviation of normal deviations, in units of the largest
 # Order of a prediction: gradient of q, Gauss-Newton part of its Hessian, or whole Hessian.
 Order = Literal["first", "rays", "second"]
-_DETERMINED = 1e-10  # smallest eigenvalue, relative to the diagonal, of what adjustments determine
+_DETERMINED = 1e-10  # eigenvalues below this, relative to the diagonal, count as 0 in `_inverse`
 _ASCENTS = 16  # number of eigenvectors from which ascents start, in both directions
 
 
@@ -97,7 +97,7 @@ def monte_carlo(
     The result does not depend on threads, tiles or devices. Where aiming misses a ray, the full ray
     search decides whether the ray exists.
 
-    problem: gives the fields, wavelengths and pupil rule; `Configurations` those of several.
+    problem: gives the fields, wavelengths and pupil rule; or `Configurations`, for several.
     perturbed: the lens and its deviations.
     perturbation: (K, P), deviations in units of their largest.
     compensator: as in `as_built`.
@@ -158,8 +158,8 @@ def spots_as_built(
     compensator: Literal["none", "focus"] | Callable[[Lens, Lens], Lens] = "focus",
     order: int = 4,
 ) -> Callable[[Lens, FieldRays], Array]:
-    """An operand of your own: the spots of lenses as built, for a design that stays good when it is
-    made.
+    """A function for `Operand`: the spots of lenses as built, for a design that is insensitive to
+    manufacturing errors.
 
     Its squares are summed over all fields, distances and wavelengths of a problem, and averaged
     over the lenses: the mean squared RMS radius after compensation, for each point. A ray that
@@ -168,7 +168,7 @@ def spots_as_built(
     perturbed: any lens of the same surfaces, and its deviations. ValueError of the merit for a lens
         of others.
     perturbation: (K, P), deviations in units of their largest, such as `draw_perturbations(
-        perturbed, 48, seed)`. Judge the design by others.
+        perturbed, 48, seed)`. Evaluate the design with other draws.
     compensator: what is adjusted in each lens: "none"; "focus", the distance of its sensor; or a
         function of the design and of a lens as built that returns the adjusted lens. With "focus"
         the values do not depend on the sensor of the design: give that a solve, or add the operand
@@ -261,11 +261,11 @@ class Predicted(NamedTuple):
 def predict(problem: AnyProblem, perturbed: PerturbedLens, compensator: Given) -> Predicted:
     """Predicts q from exact first and second derivatives by deviations.
 
-    Adjustments count as further deviations z = (p, m) of a lens that is adjusted at first; those
-    that are best for p follow from second derivatives of the sum of squares S that they minimise,
-    S_mm m + S_mp p = 0. So q is exact to second order if it is this sum; for another criterion the
-    second derivatives of m are left out. An adjustment at its limit stays there; others may exceed
-    theirs.
+    The adjustments m are treated as further deviations, z = (p, m), about the lens that is adjusted
+    without deviations. The best adjustments for p minimise a sum of squares S, and follow from its
+    second derivatives: S_mm m + S_mp p = 0. So q is exact to second order if q is this sum; for
+    another criterion the second derivatives of m are neglected. An adjustment at its limit stays
+    there; the prediction does not apply the limits of the others.
 
     problem: gives the fields, wavelengths and pupil rule.
     perturbed: the lens and its deviations.
@@ -290,8 +290,13 @@ def predict(problem: AnyProblem, perturbed: PerturbedLens, compensator: Given) -
 
 @partial(jit, wanted=ONCE)
 def _predict(problem: AnyProblem, perturbed: PerturbedLens, assembly: Assembly) -> Predicted:
-    """`predict` with the solver of the problem: J from one linearised trace, Hessians by forward
-    over reverse mode. Second derivatives of a whole trace are large to compile and run once.
+    """`predict` with the solver of the problem.
+
+    With z = (p, m), deviations and adjustments: J, the derivatives of the residuals by z, comes
+    from one linearised trace; the Hessian H of q by z, and the rows of the Hessian of S by m, come
+    from forward over reverse mode. The free adjustments follow p by dm/dp = -S_mm^-1 S_mp. With
+    D = (1, dm/dp) the model in p has the gradient D g and the Hessian D H D^T. Second derivatives
+    of a whole trace are large programs, which run once, so they are mapped one by one.
     """
     moves = jax.lax.stop_gradient(assembly.moves(problem, perturbed.lenses))
     shares = shares_of(problem)
@@ -341,7 +346,7 @@ def _predict(problem: AnyProblem, perturbed: PerturbedLens, assembly: Assembly) 
 
 
 def _inverse(matrix: Array) -> Array:
-    """Inverse of a symmetric matrix; 0 along what it does not determine."""
+    """Inverse of a symmetric matrix; 0 along eigenvectors of negligible eigenvalues."""
     size = jnp.sqrt(jnp.abs(jnp.diag(matrix)))
     size = jnp.where(size > 0, size, 1)
     scale = size[:, None] * size[None]

@@ -251,7 +251,7 @@ def _numerical_aperture(lens: Lens, rays: FieldRays) -> Array:
     square = jnp.sum((lines[..., 1:] - lines[..., :1]) ** 2, axis=0)
     sines = square * (1 - square / 4)
     top, bottom, side = jnp.moveaxis(sines, -1, 0)
-    side = side if len(lines) == 3 else top  # one radius stands for all azimuths
+    side = side if len(lines) == 3 else top  # one radius represents all azimuths
     index = lens.index(rays.scene.wavelengths)[-1]
     return index[None] * safe_sqrt((top + bottom + 2 * side) / 4)
 

@@ -93,7 +93,7 @@ class Vary:
             given = all(0 < number < np.inf for number in pair)
             require(given, f"{both}: give both, above 0 mm, got {pair[0]:g} and {pair[1]:g}")
             free = (self.low, self.high) == (-np.inf, np.inf)
-            require(free, f"{both}: stand instead of low and high; leave these out")
+            require(free, f"{both}: replace low and high; leave these out")
         least, most = PARTS[self.kind].limits
         low, high = max(self.low, least), min(self.high, most)
         between = f"{self.low:g} to {self.high:g} lies outside of {least:g} to {most:g}"
@@ -168,7 +168,7 @@ class Tie:
             require(
                 one == two,
                 f"ties: cemented: surfaces {first} and {others[0]} are of the forms {one} and "
-                f"{two}; write both alike",
+                f"{two}; give both the same form",
             )
         for kind in kinds:
             places_of("ties", lens, kind, self.surfaces)
@@ -218,7 +218,7 @@ class Variables:
         """Makes the variables of a lens.
 
         lens: the lens at the start.
-        vary: variables; the name of a kind stands for all variables of that kind.
+        vary: variables; the name of a kind alone means all variables of that kind.
         ties: numbers that follow a variable, or a number that does not change.
         solves: conditions that hold exactly.
 

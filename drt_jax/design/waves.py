@@ -123,15 +123,15 @@ def psf(
 def filter_error(
     kernels: Callable[[Lens, FieldRays], Psf], light: Numbers, noise: Numbers, power: Numbers
 ) -> Callable[[Lens, FieldRays], Array]:
-    """An operand of your own: the error of the best linear filter behind the lens, for all fields,
-    distances and wavelengths of a problem together, see `image.wiener`.
+    """A function for `Operand`: the error of the best linear filter behind the lens, common to all
+    fields, distances and wavelengths of a problem, see `image.wiener`.
 
     Its merit is the mean square error of the filtered images, summed over the channels, one for
     each wavelength; rays that fail add to it as with every operand. It needs neither images nor
-    training. Begin with a lens that spots have finished.
+    training. Start from a lens that is optimised for spots.
 
-    kernels: what the camera sees of the points, by `psf`: `lambda lens, rays: psf(lens, rays,
-        pixel)`.
+    kernels: function that returns the kernels of the object points, by `psf`:
+        `lambda lens, rays: psf(lens, rays, pixel)`.
     light: (W,) or (), solid angle of the light for which the noise is given, see `drt_jax.psf`. The
         noise of points with less light is amplified.
     noise: see `learn.noise_of`.

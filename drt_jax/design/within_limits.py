@@ -34,12 +34,15 @@ class _State(NamedTuple):
 
 
 def nearest(vector: Array, metric: Array, rows: Array, most: Array) -> Array:
-    """The x nearest to a vector v with rows @ x <= most: of least (x - v)^T metric (x - v).
+    """Projection of a vector v onto rows @ x <= most: the x that minimises
+    (x - v)^T metric (x - v).
 
-    With u >= 0, one multiplier for each row, x = v - metric^-1 rows^T u, and u is least squares
-    with the normal matrix G = rows metric^-1 rows^T: solved for a set of rows that grows by the row
-    that is violated most, and shrinks where a multiplier would become negative (Lawson and Hanson,
-    Solving Least Squares Problems, 1974, ch. 23), which always ends.
+    By the Kuhn-Tucker conditions x = v - metric^-1 rows^T u, with a multiplier u >= 0 for each row
+    that is 0 unless the row is active. For active rows, G u = rows v - most with
+    G = rows metric^-1 rows^T. This is the active-set method of non-negative least squares: add the
+    row that is violated most, solve for u, and remove rows whose multiplier would become negative,
+    until no row is violated. It always ends (Lawson and Hanson, Solving Least Squares Problems,
+    1974, ch. 23).
 
     vector: (N,). metric: (N, N), positive definite. rows: (L, N). most: (L,); inf for no limit.
     """
@@ -50,8 +53,8 @@ def nearest(vector: Array, metric: Array, rows: Array, most: Array) -> Array:
     square = matmul(rows, back) * unit[:, None]
     count, one = len(most), jnp.eye(len(most), dtype=vector.dtype)
     eps = float(jnp.finfo(vector.dtype).eps)
-    tiny = eps * one  # parts rows that are parallel
-    exact = eps**0.5 / 16  # a row counts as met up to this part of the largest multiplier
+    tiny = eps * one  # keeps the matrix regular if rows are parallel
+    exact = eps**0.5 / 16  # a row is met up to this fraction of the largest multiplier
 
     def turn(state: tuple) -> tuple:
         push, active, _, turns = state
@@ -61,7 +64,7 @@ def nearest(vector: Array, metric: Array, rows: Array, most: Array) -> Array:
         left = jnp.where(active, -jnp.inf, over - matmul(square, wanted))
         worst = jnp.argmax(left)
         ends = fits & (left[worst] <= exact * jnp.max(jnp.abs(wanted), initial=0.0))
-        # As far as no multiplier becomes negative; that of the row that stops it becomes 0.
+        # Shorten the step so that no multiplier becomes negative: one of them becomes 0.
         part = jnp.where(active & (wanted <= 0), safe_divide(push, push - wanted), 1.0)
         some = push + jnp.min(part) * (wanted - push)
         kept = active & (jnp.arange(count) != jnp.argmin(part)) & (some > 0)
@@ -84,15 +87,15 @@ def within_limits(
     surfaces overlap by no more than at `before`, and if no more rays fail. (A number that is not
     finite counts as an infinite overlap.) While the vector nearest to `after` within the bounds
     violates a limit, up to three rounds take the one nearest to `after` within the bounds and the
-    limits, linear about the last vector. If it is still not allowed, a backtracking line search
-    halves its step from `before`. If none of nine vectors is allowed, the result is `before`. So
-    the lens does not get worse even if limits cannot be met. Works in `jit`.
+    limits, which are linearised at the last vector. If it is still not allowed, a backtracking line
+    search halves its step from `before`. If none of nine vectors is allowed, the result is
+    `before`. So violations do not grow even if limits cannot be met. Works in `jit`.
 
     problem: its bounds and limits count, its merit does not.
     before, after: (N,), vectors before and after an update.
-    metric: (N, N), positive definite: a change d is as long as d^T metric d says. None: d^T d, in
-        the units of the variables. A step that moves many numbers which compensate each other needs
-        the metric that it was measured in, see `RaySteps`.
+    metric: (N, N), positive definite; the squared length of a change d is d^T metric d. None: the
+        unit matrix, in the units of the variables. If the changes of many variables in a step
+        compensate each other, use the metric of the optimiser, see `RaySteps`.
 
     Returns (N,).
     """

@@ -44,7 +44,7 @@ class System:
         as fractions of its radius, and its rotation in radians: x' = shift + (1 - compression) x.
     wavelengths: (W,), um. wavelength_weights: (W,). primary: the index of the primary wavelength.
     aperture: the file's value for `aperture_kind`; None if the aperture is the size of the stop.
-    ray_aiming: where the other program aims rays. `off`: at the paraxial entrance pupil, see
+    ray_aiming: point at which the other program aims rays. `off`: the paraxial entrance pupil, see
         `with_paraxial_pupil`. `chief` (CODE V): the chief ray at the centre of the stop, the others
         around it over an entrance pupil of paraxial width. Otherwise at the stop, as here.
     notes: features of the file that the lens lacks or that are read differently.
@@ -302,7 +302,11 @@ def _first(record: Record, lens: Lens) -> tuple[FirstOrder, float, list[float]]:
 
 
 def _opened(record: Record, lens: Lens) -> Lens:
-    """The lens with its stop as wide as the aperture requires in paraxial optics."""
+    """The lens with its stop as wide as the aperture requires in paraxial optics.
+
+    Each kind of aperture gives the radius `wide` of the entrance pupil, mm. The stop is scaled by
+    the ratio of this radius to that of the present entrance pupil.
+    """
     use, semi = record.use, float(lens.semi_diameter[lens.stop])
     value = float(use.aperture or 0)
     first, _, (front, last) = _first(record, lens)

@@ -287,7 +287,13 @@ class _Frames:
     before: list[tuple[np.ndarray, np.ndarray, bool]] = dataclasses.field(default_factory=list)
 
     def parts(self, surface: Surface, image: bool) -> list[Row | Breaking]:
-        """A surface with the breaks before and behind it; the last part takes its thickness."""
+        """A surface with the breaks before and behind it; the last part takes its thickness.
+
+        A decentre and tilt is a break in front of the surface, which moves all that follows. With
+        DAR it moves the surface alone; with REV the inverse move stands behind the surface; with
+        BEN the tilt is repeated behind it, as at a folding mirror; RET returns to the axis of an
+        earlier surface.
+        """
         kind, line = surface.turn, surface.move_line
         x, y, z, a, b, c = (surface.moves.get(key, 0.0) for key in MOVES)
         shift = (x * surface.unit, y * surface.unit, z * surface.unit)

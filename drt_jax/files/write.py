@@ -44,14 +44,14 @@ def save_lens(lens: Lens | System | Sequence[Lens | System], path: str | pathlib
     is called name*.
 
     lens: a lens; or a `System`, as `System.of(lens, scene)`, whose fields, wavelengths, weights,
-        vignetting and distance of the object stand in `.zmx` and `.seq` files, with the size of the
-        stop; a lens alone is written with an axial field at infinity and the d line. A warning
-        tells what `.yaml` has not. Several systems are configurations (zoom positions) of one lens,
-        which differ in numbers: rows behind MNUM, ZOO.
+        vignetting and distance of the object are written into `.zmx` and `.seq` files, with the
+        size of the stop; a lens alone is written with an axial field at infinity and the d line. A
+        warning names what `.yaml` does not hold. Several systems are configurations (zoom
+        positions) of one lens, which differ in numbers: rows behind MNUM, ZOO.
     path: of the file, which is overwritten; it ends in `.yaml`, `.yml`, `.zmx` or `.seq`.
 
-    LensError for another ending, if the file cannot hold the lens, such as a prescription a curved
-    sensor, if `Lens.check` or `load_lens` refuse it, or if the file cannot be written.
+    LensError for another ending, if the format cannot hold the lens (a prescription has no curved
+    sensor), if `Lens.check` or `load_lens` refuse it, or if the file cannot be written.
     """
     kind = known_ending(path)
     given = [lens] if isinstance(lens, Lens | System) else [*lens]

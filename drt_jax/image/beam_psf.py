@@ -84,8 +84,8 @@ class Sampling:
 
         kind: "gaussian", "rays" or "waves".
         rule: pupil rule, whose symmetry and kind (`Gauss` or `Clipped`) the rays have.
-        cells: number of cells along a side of the pupil grid. Too few lower the contrast of a large
-            blur, and never raise it.
+        cells: number of cells along a side of the pupil grid. With too few, the contrast of a large
+            blur is too low, never too high.
         degree: of the polynomials of the pupil.
         """
         return cls(kind, beam_rule(degree, rule.symmetry, rule), cells)

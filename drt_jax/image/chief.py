@@ -54,8 +54,8 @@ class FieldCurvature(NamedTuple):
     """Foci of narrow pencils about the chief rays, (..., W), mm along the z axis of the sensor,
     from where the chief ray meets it; inf for none.
 
-    tangential: of rays that cross the stop beside its centre in the direction of the field (y, for
-        the axis).
+    tangential: of rays whose stop points are displaced from the centre along the field (y, for the
+        axis).
     sagittal: of rays that cross it at right angles to that.
     """
 
@@ -124,7 +124,7 @@ def chief_ray_angle(lens: Lens, scene: Scene) -> Array:
 
 
 def lateral_colour(lens: Lens, scene: Scene, reference: int | None = None) -> Array:
-    """Hits of the chief rays on the sensor, less those of a reference wavelength.
+    """Hits of the chief rays on the sensor, minus the hits in a reference wavelength.
 
     lens, scene: as in `field_curvature`.
     reference: index of the reference wavelength; None: the middle one, W // 2.
@@ -210,8 +210,14 @@ def _distortion(
     calibrated: bool,
     afocal: bool,
 ) -> Distortion:
-    """`distortion` from chief rays of fields (F + 1, 2), the axis first, and scale (W, 2, 2), mm;
-    None for that of rays near the axis."""
+    """`distortion` from chief rays of fields (F + 1, 2), the axis first.
+
+    The ideal image of a field is scale t from the image of the axis, where t is tan(field), or the
+    field itself for the mapping "angle". A calibrated scale is multiplied by the least-squares
+    factor sum(real . ideal) / sum(ideal . ideal).
+
+    scale: (W, 2, 2), mm; None for the derivative of the hits by the field on the axis.
+    """
     scale = found.by_field[0] if scale is None else scale
     whole = found.whole[1:] & found.whole[:1]
     place = jnp.tan(fields[1:])

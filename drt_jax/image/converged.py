@@ -66,7 +66,7 @@ _CLIPPED = (
 # Numbers of rays that patterns are padded to, so that only a few programs are compiled.
 _SIZES = {"rotational": (_MAX_ORDER + 2,), "bilateral": (208, 416, 1768, 3696)}
 _SIZES["none"] = _SIZES["bilateral"]
-# Number of rules that are weighed at once: the orders of a clipped group.
+# Number of rules whose moments one program computes: the orders of a clipped group.
 _AT_ONCE = 3
 
 

@@ -64,7 +64,7 @@ class DepthMoments:
 
 
 def depth_moments(lens: Lens, scene: Scene, tolerance: float | None = None) -> DepthMoments:
-    """Moments for every sensor position and every distance between those of a scene.
+    """Moments for every sensor position and every distance within the range of a scene.
 
     lens: the lens.
     scene: one field at the nearest and the farthest distance, as of `Scene.point`.
@@ -76,7 +76,7 @@ def depth_moments(lens: Lens, scene: Scene, tolerance: float | None = None) -> D
     inside a trace, and unless 0 < near < far.
     """
     if not concrete(scene.distance):
-        raise ValueError("inside jax.jit or jax.vmap the nodes cannot follow: give known distances")
+        raise ValueError("inside jax.jit or jax.vmap nodes cannot be chosen: give known distances")
     near, far = (float(end(scene.distance)) for end in (np.min, np.max))
     require(0 < near < far, f"expected 0 < near < far, got near {near!r} and far {far!r} mm")
     low, high = 1 / far, 1 / near

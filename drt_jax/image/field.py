@@ -15,7 +15,7 @@ from ..rays.trace import trace_bundle
 
 _STEPS = 20
 _NEAR = 1e5  # rounding errors of a chief ray that meets its point, relative, in units of `eps`
-# Stop points: the centre for the chief ray, and one beside it, because the search scales its steps
+# Stop points: the centre for the chief ray, and one near it, because the search scales its steps
 # with the width of the beam. Without it the chief ray is not found if the stop is at the first
 # vertex.
 CHIEF = np.array([[0.0, 0.0], [0.0, 0.1]])

@@ -157,7 +157,8 @@ def kernel_grid(lens: Lens, wavelengths: Numbers, sampling: GridMethod) -> Kerne
 
 @functools.partial(jit, wanted=LARGE)
 def _kernel_grid(lens: Lens, method: GridMethod, wavelengths: Array) -> KernelGrid:
-    """`kernel_grid` of arrays: traces the unique nodes, then mirrors them."""
+    """`kernel_grid` of arrays. Only the unique nodes are traced; every node of the grid is then a
+    copy of one of them, whose x and y are swapped or mirrored, see `unique_nodes`."""
     nodes, index, turned = unique_nodes(method.half, method.symmetry)
     tangents = jnp.asarray(nodes, method.step.dtype) * method.step
 
@@ -228,7 +229,7 @@ def grid_method(
     """Chooses the settings of `kernel_grid`. All arguments are known numbers.
 
     lens: the lens.
-    scene: its largest angles along x and y are those of the grid; its distances, as of
+    scene: its largest angles along x and y are the extent of the grid; its distances, as of
         `Scene.grid`, are equidistant in 1 / distance, rising or falling.
     pixel: side of a pixel, mm.
     size: number of pixels along a side of a kernel, odd; by default it extends to 4.5 standard

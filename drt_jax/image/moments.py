@@ -86,8 +86,8 @@ def check_sensor(lens: Lens) -> None:
     for g, ((first, _), about) in enumerate(zip(lens.elements.spans, lens.elements.about)):
         if about == lens.count and first < lens.count:
             raise ValueError(
-                f"elements[{g}]: turns surfaces about the sensor, so that they move with it: turn "
-                "them about another surface with the same pivot, or take psf_moments"
+                f"elements[{g}]: rotates surfaces about the sensor, so that they move with it: "
+                "rotate them about another surface with the same pivot, or use psf_moments"
             )
 
 
@@ -96,7 +96,7 @@ def check_focus(lens: Lens) -> None:
     check_sensor(lens)
     if lens.afocal:
         raise ValueError(
-            "afocal: no place of the sensor focuses this lens: vary a thickness, or take `focus` "
+            "afocal: no sensor position focuses this lens: vary a thickness, or take `focus` "
             "of transfer and encircled_energy, in 1e-3 dioptre"
         )
 

@@ -195,11 +195,11 @@ def chosen_psf(
             pairs = ((beam, w) for beam in beams for w in range(waves.size))
             return max(_misfit(b, waves, w, pixels.side, rounded, degree) for b, w in pairs)
 
-        # The fit may take half of the tolerance; what it leaves is for the cells.
+        # Half of the tolerance is for the error of the fit, the rest for the grid of cells.
         ((degree, beams),), error = refine(fits(), misfit, tolerance / 2, together=1)
         if error > tolerance / 2:
             warn(
-                f"polynomials of degree {degree} give back the rays to {error:.1e} only, not to "
+                f"polynomials of degree {degree} reproduce the rays to {error:.1e} only, not to "
                 f"half of {tolerance:.1e}"
             )
         beams = [dataclasses.replace(b, degree=degree, azimuths=degree) for b in beams]
@@ -354,7 +354,7 @@ def _warn(
     needed = np.min(np.max(reach, axis=0)) / float(np.asarray(pixels.side))
     more = max(2 * int(np.ceil(needed)) + 1, size + 2)
     warn(
-        f"size: {100 * np.max(lost):.2g} % of the light falls beside a kernel of {size} x {size} "
+        f"size: {100 * np.max(lost):.2g} % of the light falls outside a kernel of {size} x {size} "
         f"pixels; {more} x {more} hold 99 %"
     )
 

@@ -1,4 +1,5 @@
-"""Ever finer trials until the error is within a tolerance; and so the number of pupil cells.
+"""Refinement: finer trials until the error is within a tolerance. It also finds the number of pupil
+cells.
 
 For the cells, the rays are traced once. Each trial evaluates their polynomials on a finer grid. The
 error falls with the square of the number of cells or faster, so the change from one trial to the
@@ -35,16 +36,16 @@ TOLERANCE = 1e-3
 
 
 def require_known(tree: Any, what: str, function: str) -> Any:
-    """The numbers of a tree, from which a sampling is chosen. ValueError inside `jit` and `vmap`.
+    """The numbers of a tree from which a sampling is chosen. ValueError inside `jit` and `vmap`.
 
     tree: arguments of the choice.
-    what, function: what is chosen, and the public function that takes it, for the message.
+    what, function: name of the sampling, and the public function that takes it, for the message.
     """
     known = known_values(tree)
     if known is None:
         raise ValueError(
-            f"inside jax.jit or jax.vmap {what} cannot follow from a tolerance: make the sampling "
-            f"outside and pass it on, sampling=drt_jax.converge(drt_jax.{function}, ...)"
+            f"inside jax.jit or jax.vmap {what} cannot be chosen for a tolerance: make the "
+            f"sampling outside and pass it on, sampling=drt_jax.converge(drt_jax.{function}, ...)"
         )
     return known
 

@@ -58,6 +58,9 @@ _WIDEST = 11.4
 def _strip(maps: Maps, method: RenderMethod, picture: Array, row: Array, lit: bool) -> Array:
     """A row of tiles of one distance.
 
+    The picture is warped to the sensor, by cubic convolution at the interpolated sources, blurred
+    with the kernels of the tiles, and multiplied with the relative light.
+
     maps: maps of one distance.
     method: from `render_method`.
     picture: (H, W, C), in the dtype of `maps`.
@@ -205,7 +208,7 @@ def render_method(
         side = float(check_pixels(pixel, 1, lens.curvature.dtype).side)
         waves = lens.checked_wavelengths(wavelengths).reshape(-1)
         focal = float(np.mean(np.asarray(first_order(lens, jnp.inf, waves).effective_focal_length)))
-        require(0 < abs(focal) < np.inf, "lens: without a focal length it makes no picture")
+        require(0 < abs(focal) < np.inf, "lens: has no focal length, so it forms no image")
         far = layer_distances(distance, shape, layers)
         angles = _angles(lens, shape, far, side, focal, waves)
         given = lens, Scene.grid(angles[None], far, waves), side, size, nodes, kind

@@ -152,13 +152,13 @@ def sensor_layer(
 
 
 def noise_of(noise: Numbers, light: Array, value: Numbers = _MEAN) -> Array:
-    """Standard deviation of the noise of an image whose gain makes up for the light that is lost.
+    """Standard deviation of the noise of an image whose gain compensates vignetting.
 
     noise: standard deviation of the read noise, (); or of read and shot noise, (2,), that of the
         shot noise at the value 1, both where the light is 1.
-    light: on the sensor, relative; below 0.02 the gain stays.
-    value: of the image without noise, from 0 to 1, of a shape that broadcasts with `light`; by
-        default the mean of photographs.
+    light: relative light on the sensor; below 0.02 the gain is that of 0.02.
+    value: pixel values without noise, from 0 to 1, which broadcast with `light`; by default the
+        mean of photographs.
     """
     gain = 1 / jnp.maximum(light, _DARKEST)
     read, *shot = jnp.atleast_1d(jnp.asarray(noise, gain.dtype))

@@ -76,9 +76,9 @@ class Spots:
         solid angle; for a round pupil the first zero of the diffraction pattern.
     throughput, solid_angle: (..., W), as of `vignetting` and `solid_angle`.
     left_out: (..., W), fraction of 175 rays, evenly over the stop and on its rim, that fail for
-        another reason than an aperture (see `Status`), and so do not count in any number above:
-        they miss a surface, are totally reflected, or would have to step back where surfaces cross.
-        Programs that let rays step back count those, and report larger spots.
+        another reason than an aperture (see `Status`), and so are not part of any number above:
+        they miss a surface, are totally reflected, or would have to travel backwards where surfaces
+        cross. Programs that trace such rays backwards include them, and report larger spots.
 
     Lengths are inf where no light arrives; those from the chief ray also where it fails.
     """
@@ -200,7 +200,7 @@ def light_rule(lens: Lens, scene: Scene, order: int = _ORDER) -> Gauss | Clipped
     known = known_values((lens, scene))
     if known is None:
         raise ValueError(
-            "inside jax.jit or jax.vmap the rays cannot follow from what is clipped: make the rule "
+            "inside jax.jit or jax.vmap the rule cannot depend on what is clipped: make the rule "
             "outside and pass it on, sampling=drt_jax.converge(drt_jax.spot_diagram, lens, scene), "
             "or name one, such as sampling=drt_jax.Gauss(12, 'bilateral')"
         )

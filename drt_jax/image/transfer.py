@@ -96,7 +96,7 @@ def transfer(
 
 
 class Plan(NamedTuple):
-    """What a sampling asks for.
+    """A sampling in full.
 
     kind: "waves" or "rays".
     rule: rays and polynomials of the beams.
@@ -285,7 +285,12 @@ def _of_rays(
 def _of_waves(
     lens: Lens, beam: Beam, wavelengths: Array, frequencies: Array, centre: Array, cells: int
 ) -> tuple[Array, Array]:
-    """Diffraction transfer function and its limit, (W, 2, N) each, see the module docstring."""
+    """Diffraction transfer function and its limit, (W, 2, N) each, see the module docstring.
+
+    For each shear s the grid covers the overlap of the two pupils, which are shifted by s / 2 and
+    -s / 2: their extent less |s|. The integrals are divided by that without shear. The factor
+    exp(2 pi i f.centre) refers the phase to the centroid of the light.
+    """
     pupil = pupil_function(lens, beam, wavelengths, cells)
     low, high = beam.directions_extent()
     middle = (low + high) / 2

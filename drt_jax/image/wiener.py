@@ -1,8 +1,8 @@
 """The best linear filter behind a lens, and its error in closed form.
 
-A scene x with the power spectrum S(f), (C, C) at each frequency, comes through the kernel of an
-object point p, with the transfer functions H_p(f), diagonal over the channels, and noise of the
-variance N, as y = H_p x + n. The filter that serves all points with the least mean square error is
+Let x be a scene with the power spectrum S(f), (C, C) at each frequency f. The kernel of an object
+point p has the transfer functions H_p(f), diagonal over the channels, and the noise n the variance
+N; the image is y = H_p x + n. The one filter with the least mean square error over all points is
 (Wiener 1949, here over channels and points)
 
     W = S M^* R^-1,  R = mean_p(H_p S H_p^*) + N,  M = mean_p(H_p),  error = diag(S - W M S).
@@ -45,7 +45,8 @@ def power_of(patches: np.ndarray, side: int = 64) -> np.ndarray:
     line = np.hanning(side + 2)[1:-1]
     window = np.outer(line, line)[:, :, None]
     spectra = np.fft.rfft2((real - np.mean(real, (0, 1, 2))) * window, axes=(1, 2))
-    # Scenes are as likely seen in a mirror, so the cross spectrum of two channels is real.
+    # A scene and its mirror image are equally likely, so the cross spectrum of two channels is
+    # real.
     power = np.einsum("byxi,byxj->yxij", spectra, np.conj(spectra)).real
     return power / (len(patches) * np.sum(window**2))
 
@@ -53,10 +54,10 @@ def power_of(patches: np.ndarray, side: int = 64) -> np.ndarray:
 def wiener(kernels: Array, noise: Numbers, power: Numbers, size: int = 33) -> Wiener:
     """The best linear filter of a camera. Differentiable.
 
-    kernels: (P, C, K, K), of P object points that count alike, with K odd and one centre for all
-        channels, as of `psf`.
+    kernels: (P, C, K, K), of P object points of equal weight, with K odd and one centre for all
+        channels, as from `psf`.
     noise: standard deviation of the noise, (P, C), or what broadcasts to it, see `noise_of`.
-    power: (N, N // 2 + 1, C, C), see `power_of`, with N of K and of `size` at least.
+    power: (N, N // 2 + 1, C, C), see `power_of`; N is at least K and at least `size`.
     size: number of taps T along a side, odd.
 
     ValueError for sizes that are even, and for a spectrum of too few frequencies.
@@ -78,7 +79,7 @@ def wiener(kernels: Array, noise: Numbers, power: Numbers, size: int = 33) -> Wi
     filters = jnp.conj(jnp.swapaxes(adjoint, -1, -2))
     explained = einsum("yxij,yxij->yxi", filters, mixed).real
     left = jnp.diagonal(power, 0, 2, 3) - explained
-    # Half of the plane stands for all of it.
+    # The spectrum of a real image is Hermitian, so half of the plane is enough.
     twice = np.where(np.isin(np.arange(count // 2 + 1), (0, count / 2)), 1.0, 2.0) / count**2
     error = left * jnp.asarray(twice, left.dtype)[None, :, None]
     taps = jnp.fft.irfft2(filters, (count, count), axes=(0, 1))
@@ -92,7 +93,7 @@ def apply_filter(taps: Array, images: Array) -> Array:
     taps: (T, T, C, C), [y, x, in, out].
     images: (B, H, W, C), of the same dtype.
 
-    Returns (B, H - T + 1, W - T + 1, C): the pixels that the filter knows all around.
+    Returns (B, H - T + 1, W - T + 1, C): the pixels whose whole neighbourhood lies in the image.
     """
     shape, size = images.shape[1:3], taps.shape[0]
     spectra = jnp.fft.rfft2(images, axes=(1, 2))

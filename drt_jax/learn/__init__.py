@@ -1,4 +1,4 @@
-"""The network and its training; no optics formula in here.
+"""The network, its data and its training. Optics are computed elsewhere.
 
 Data: `load_patches`, `batches`. One blur for all patches, as in the paper: `make_imager`,
 `make_step`. Object points anywhere in the field: `FieldImager`, `draw_points`, `make_field_step`.

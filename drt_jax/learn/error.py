@@ -1,4 +1,4 @@
-"""What a camera's last link makes of its images: restored images, or their mean absolute error."""
+"""The last part of a camera: images that a network restores, or their mean absolute error."""
 
 import dataclasses
 from collections.abc import Callable
@@ -15,13 +15,14 @@ from .convolution import AT_ONCE
 Restore = Callable[[Any, Array], Array]
 # A function of a network, its weights, the images of the sensor and the true images.
 Last = Callable[[Restore | None, Any, Array, Array], Array]
-# What is no faster in a loop: XLA's convolutions, whose gradients take 20 times as long there
-# (jax#12868), and devices that would meet in each turn.
+# Primitives for which no loop over parts of the batch is used: XLA's convolutions, whose gradients
+# take 20 times as long in a loop (jax#12868), and work shared by devices, which would synchronise
+# in each iteration.
 _SLOW = "conv_general_dilated", "shard_map"
 
 
 def restored(restore: Restore | None, weights: Any, images: Array, truth: Array) -> Array:
-    """The images that the network restores, (B, H, W, C); those of the sensor without a network.
+    """The images that the network restores, (B, H, W, C); without a network the sensor images.
 
     restore, weights, images, truth: as of `mean_error`.
     """
@@ -31,9 +32,9 @@ def restored(restore: Restore | None, weights: Any, images: Array, truth: Array)
 def mean_error(restore: Restore | None, weights: Any, images: Array, truth: Array) -> Array:
     """Mean absolute error of the restored images, ().
 
-    On a CPU the gradient of a few images, of some 4096 pixels together, is found with their error
-    before the next ones are restored, so that their features stay in the cache: those of a whole
-    batch would be new memory in each step. Differentiable in every mode and to any order.
+    On a CPU a loop computes error and gradient of a few images at a time, of some 4096 pixels
+    together, so that their features stay in the cache; the features of a whole batch would have to
+    be allocated in each step. Differentiable in every mode and to any order.
 
     restore: (weights, images) -> images, each from its own image alone; it may be a function that
         devices share, see `devices.shared`. None for a camera without a network.
@@ -47,7 +48,12 @@ def mean_error(restore: Restore | None, weights: Any, images: Array, truth: Arra
 
 
 def _total_error(restore: Restore) -> Callable[[Any, Array, Array], Array]:
-    """(weights, images, truth) -> sum of the absolute errors, (1,); one of each device."""
+    """(weights, images, truth) -> sum of the absolute errors, (1,); one of each device.
+
+    A custom JVP computes the error and all its derivatives together, for one group of images after
+    the other in a `lax.scan`, and then multiplies the derivatives with the tangents. So only the
+    features of one group are in memory, also in reverse mode.
+    """
     if isinstance(restore, Shared):
         return dataclasses.replace(restore, function=_total_error(restore.function))
 
@@ -75,7 +81,7 @@ def _total_error(restore: Restore) -> Callable[[Any, Array, Array], Array]:
     def total_jvp(primals: Any, tangents: Any) -> tuple[Array, Array]:
         value, found = by_groups(*primals)
         pairs = zip(jax.tree.leaves(found), jax.tree.leaves(tangents), strict=True)
-        # What does not move costs nothing: XLA drops its slopes.
+        # Derivatives by an argument without a tangent are not used, so XLA does not compute them.
         moved = (jnp.sum(s * t) for s, t in pairs if not isinstance(t, SymbolicZero))
         return value[None], sum(moved, jnp.zeros_like(value)).astype(value.dtype)[None]
 

@@ -1,7 +1,7 @@
 """Lens and network trained together over the field and over depth.
 
-The kernels of object points, which are drawn anew in each step, go through the sensor layer and the
-network.
+Each step draws new object points. Patches are blurred by the kernels of these points, and pass
+through the sensor layer and the network.
 """
 
 import dataclasses
@@ -78,13 +78,13 @@ class FieldImager:
         key: Array,
         last: Last = restored,
     ) -> tuple[Array, Array, Array]:
-        """True, sensor and restored images (B, H, W, C), in the dtype of the imager: of all, the
-        part that the network restores, such as the middle.
+        """True, sensor and restored images (B, H, W, C), in the dtype of the imager. All three are
+        cut to the part that the network restores, such as the middle.
 
         parameters: "optics", and "network" for a network.
         scenes: uint8 (B, H + K - 1, W + K - 1, C).
         seen, noise, key: as in `sensor`.
-        last: what takes the place of the restored images, such as `mean_error`, ().
+        last: function whose result replaces the restored images, such as `mean_error`, ().
         """
         real = scenes.astype(self.dtype) / 255
         image = self.sensor(parameters["optics"], real, seen, noise, key)
@@ -186,7 +186,8 @@ def make_field_step(
     draw: function that returns the object points of a step from a PRNG key, for instance by
         `draw_points`.
     seed: points and noise depend only on it and on the index of the step.
-    hold: keeps the optics of Adam within what can be built, see `design.within_limits`.
+    hold: function that keeps the optics within limits after a step of Adam, see
+        `design.within_limits`.
 
     init(parameters) -> state; step(state, scenes, noise, index) -> (state, metrics), jitted, with
     the state donated. metrics: loss, (). Parameters without "network" train the optics alone.

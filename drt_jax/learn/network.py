@@ -84,10 +84,10 @@ def red_net(
 
 
 def filtered(network: tuple[Callable, Callable], taps: Array) -> tuple[Callable, Callable]:
-    """A network behind a linear filter of many taps, which is trained with it, as (init, apply).
+    """A linear filter of many taps followed by a network, as (init, apply); both are trained.
 
-    A network of small kernels does not see a wide blur; one that begins with the best filter of its
-    lens, see `wiener`, does.
+    A network of small kernels cannot restore a wide blur. The best linear filter of the lens, see
+    `wiener`, does this in front of the network.
 
     network: (init, apply), such as `red_net`.
     taps: (T, T, C, C), [y, x, in, out], at the start, in the dtype of the images.

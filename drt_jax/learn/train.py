@@ -59,7 +59,7 @@ def make_imager(
     camera: constants of the sensor layer.
     convolve: `convolve`; or `convolve_taps` for values and forward mode, which `make_step` uses
         where a single number is trained.
-    dtype: of scenes and images, and of the network; kernels are cast to it.
+    dtype: of scenes, images and network; kernels are cast to it.
 
     The function maps (parameters {"optics", "network"}, scenes uint8 (B, H + K - 1, W + K - 1, C),
     distance in mm, noise, key) to the true, the sensor and the restored image (B, H, W, C), of this

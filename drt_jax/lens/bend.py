@@ -57,10 +57,11 @@ def bent(
 ) -> Lens:
     """The lens with an element bent at constant power.
 
-    All faces of the element but the last get the curvature more; the last one gets what keeps the
-    paraxial power of the thick element. Of a thin element of curvatures c1 and c2 the shape factor
-    (c1 + c2) / (c1 - c2) grows by 2 curvature / (c1 - c2). All vertices and the sensor stay, so
-    that principal planes move: the focal length of a lens of several elements changes a little.
+    The curvature is added to all faces of the element except the last. The curvature of the last is
+    solved for, so that the paraxial power of the thick element stays the same. The shape factor
+    (c1 + c2) / (c1 - c2) of a thin element grows by 2 curvature / (c1 - c2). All vertices and the
+    sensor stay, so the principal planes move, and the focal length of a lens of several elements
+    changes a little.
 
     lens: the lens.
     surfaces: the faces of the element, such as (0, 1); of a cemented one all its faces.
@@ -88,8 +89,9 @@ def split(
     The outer faces and all other surfaces stay as they are and where they are. The new faces,
     numbers `surface + 1` and `surface + 2`, are spheres without an aperture: the curvature of the
     first gives the first element its share of the power, that of the second gives the pair the
-    paraxial power of the element. Its principal planes may move by a part of the gap. The glass is
-    shared as the power is, so that rims do not become thinner than they were in proportion.
+    paraxial power of the element. Its principal planes may move by a part of the gap. The glass
+    thickness is divided in the same ratio as the power, so that rims become thinner only in
+    proportion.
 
     lens: the lens.
     surface: the first face of the element, cemented to others or not.

@@ -1,7 +1,7 @@
 """Surfaces, elements and plates put into a lens and taken out, another stop, aspheric terms.
 
-All that a lens carries goes along: stop, apertures, phases, tilts and elements. Numbers of surfaces
-count from 0 in the lens that is given. Numbers may be traced, except where an error says otherwise.
+Stop, apertures, phases, tilts and elements move with their surfaces. Numbers of surfaces count
+from 0 in the lens that is given. Numbers may be traced, except where an error says otherwise.
 """
 
 import dataclasses
@@ -37,10 +37,10 @@ def inserted(
 ) -> Lens:
     """The lens with two surfaces more, of equal shape, and another medium between them.
 
-    Glass in air is a thin meniscus; air in glass splits an element. Both change rays by as little
-    as they are thin, so that a design can go on from there. Beside a surface of its own shape,
-    `like`, a meniscus makes a minimum nearly a saddle point, from which two ways lead down (Bociort
-    and van Turnhout, Opt. Eng. 48, 063001, 2009).
+    Glass in air is a thin meniscus; air in glass splits an element. The change of the rays is
+    proportional to the thickness, so that a design can continue from there. A meniscus next to a
+    surface of its own shape, `like`, turns a minimum nearly into a saddle point, from which the
+    merit falls in two directions (Bociort and van Turnhout, Opt. Eng. 48, 063001, 2009).
 
     lens: the lens.
     surface: in the medium behind it the pair stands; -1 for a pair in front of the lens.
@@ -112,8 +112,8 @@ def with_plate(
     """The lens with a plane plate, such as a filter or a cover glass, and all that stands behind it
     moved away by the paraxial shift t (1 - n0 / n).
 
-    Paraxial rays of this wavelength are behind it what they were. `inserted` with `like=-1` puts in
-    the plate and moves nothing.
+    Paraxial rays of this wavelength do not change behind the plate. `inserted` with `like=-1`
+    inserts the plate and moves nothing.
 
     lens, surface, glass, distance, thickness: as in `inserted`; behind the last surface the
         distance counts from there towards the sensor.

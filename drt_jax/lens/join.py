@@ -44,8 +44,8 @@ def joined(first: Lens, second: Lens, gap: Numbers, stop: str = "first") -> Lens
     """A lens behind another one, such as a camera behind an attachment or an eyepiece behind an
     objective.
 
-    All that both carry goes along, but the sensor of the first with its apertures and tilts. What
-    the first one moves together with its sensor, a coordinate break, moves the second lens too.
+    The result has all parts of both, except the sensor of the first with its apertures and tilts. A
+    coordinate break of the first lens, which moves its sensor, also moves the second lens.
 
     first, second: the lenses.
     gap: (), mm along the axis from the last vertex of the first lens to the first vertex of the

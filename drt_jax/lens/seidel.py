@@ -114,9 +114,9 @@ def _seidel(
 def third_order(lens: Lens, scene: Scene) -> ThirdOrder:
     """Third-order aberrations of each surface; `.total` adds them up.
 
-    Conics and the r^2 and r^4 terms of aspheres count. Odd powers of r have no place in this theory
-    and are neglected. Transverse aberrations are 0 for an image at infinity, and colour is 0 for
-    one wavelength.
+    Conics and the r^2 and r^4 terms of aspheres are included. The theory does not cover odd powers
+    of r, which are neglected. Transverse aberrations are 0 for an image at infinity, and colour is
+    0 for one wavelength.
 
     lens: the lens.
     scene: the edge of the field, along y, and wavelengths.
@@ -141,7 +141,13 @@ def third_order(lens: Lens, scene: Scene) -> ThirdOrder:
 
 
 def _third_order(lens: Lens, scene: Scene) -> ThirdOrder:
-    """`third_order` of one object point; 0 where the lens is tilted or the field is not along y."""
+    """`third_order` of one object point; infinite if the lens is tilted or the field not along y.
+
+    With h = 1 / (2 n' u') of the marginal ray at the image, the Seidel sums give the transverse
+    aberrations h S1, 3 h S2, h (3 S3 + S4), h (S3 + S4), h S4 and h S5. The colour of a surface is
+    2 h A y D(dn / n), with the invariant A of the marginal ray (axial) or B of the chief ray
+    (lateral), and dn between the shortest and the longest wavelength.
+    """
     moves = lens.decentre, lens.tilt, lens.elements and (lens.elements.shift, lens.elements.tilt)
     system, vergence = paraxial_system(lens, scene.wavelengths), scene.vergence
     bent = jnp.any(jnp.array([jnp.any(move != 0) for move in jax.tree.leaves(moves)], bool))

@@ -1,7 +1,7 @@
 """A lens at another temperature: indices, shapes, thicknesses and the mount.
 
-Lengths of a lens hold at 20 C, and the constants of each glass at the temperature of its catalogue.
-At another temperature t
+Lengths of a lens are valid at 20 C, the constants of each glass at the temperature of its
+catalogue. At another temperature t
 
 - the absolute index of a glass changes by Schott's formula (TIE-19), with d = t - `Glass.celsius`,
   (n^2 - 1) / (2 n) (D0 d + D1 d^2 + D2 d^3 + (E0 d + E1 d^2) / (L^2 - L_TK^2)), and indices are
@@ -49,7 +49,7 @@ def _known(name: str, glasses: Mapping[str, Glass]) -> Glass:
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class ThermalModel:
-    """How the glasses and mounts of a lens change with temperature. Expansions are in 1e-6/K.
+    """Thermal constants of the glasses and mounts of a lens. Expansions are in 1e-6/K.
 
     index: (S + 1, 6), `Glass.thermal` of the media; 0 for air.
     celsius: (S + 1,), temperature at which the constants of the media hold, C.
@@ -100,7 +100,7 @@ def at_temperature(
     Radii, conics, aspheric and diffractive terms, semi-diameters and apertures change with their
     surface, thicknesses of glass with the glass. An air space changes by its mount between the
     semi-diameters of its two surfaces (at the vertex, where a surface has none), decentres and
-    pivots by the mount. A wavelength stands for the same light at all temperatures. Names of
+    pivots by the mount. A wavelength means the same light at all temperatures. Names of
     glasses get the temperature, where it is known.
 
     Differentiable by all numbers, also in `jit` and `vmap`.
@@ -110,7 +110,7 @@ def at_temperature(
     model: of this lens.
     pressure: (), of the air, atmospheres; 0 for a lens in vacuum.
 
-    ValueError for a lens that has been through this function, and for other shapes.
+    ValueError for a lens that is a result of this function, and for other shapes.
     """
     require(lens.dispersion.thermal is None, "lens: is at another temperature; take that at 20 C")
     dtype, count, media = lens.curvature.dtype, lens.count, np.array(lens.glasses)

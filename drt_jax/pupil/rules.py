@@ -93,8 +93,8 @@ def require_fit(symmetry: Symmetry, field: Numbers) -> None:
     if concrete(field) and np.any(np.abs(np.asarray(field)[..., : _ACROSS[symmetry]]) > _MAX_ANGLE):
         where = {"rotational": "the axis", "bilateral": "fields along y"}[symmetry]
         raise ValueError(
-            f"the rule is made for {where}, where a part of the pupil stands for all of it; the "
-            "field lies elsewhere: make the rule or model for all fields that it is used for"
+            f"the rule is made for {where} and traces a part of the pupil only; the field has "
+            "another symmetry: make the rule or model for all fields that it is used for"
         )
 
 

@@ -145,6 +145,9 @@ def aim(
 ) -> Aimed:
     """Aims rays at stop points.
 
+    The root finding of one ray is mapped over the rays, then over the wavelengths, each with its
+    own indices and phases.
+
     target: D arrays (W, Q), stop points, mm.
     launch: D arrays (W, Q), first guesses of the launch points, mm.
     sizes: () and (), radius of the beam at the stop, and length of the longest first step, mm.

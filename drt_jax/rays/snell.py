@@ -263,8 +263,8 @@ def _follow(
     it (`_refract`) and transforms it back. The first failure decides the status: MISSED if the ray
     does not cross the row, or crosses it from the wrong side; MISSED or CROSSED if the crossing
     lies behind the ray (MISSED on the first row and the sensor, CROSSED on others); TIR if no light
-    passes. A failed ray goes on with undefined values, or on the axis if `smooth`. A row that does
-    not bend leaves the ray as it is and changes only the status.
+    passes. A failed ray continues with undefined values, or on the axis if `smooth`. A row that
+    does not bend leaves the ray as it is and changes only the status.
 
     launch: D arrays (...), mm on the launch plane.
     to_stop: True to trace only to the stop.

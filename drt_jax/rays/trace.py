@@ -147,7 +147,7 @@ def at_infinity(
 
     An afocal lens is traced as if an ideal lens of focal length F = 1 m stood behind it. The sensor
     of the prescription lies in the front focal plane of the ideal lens, and a second sensor lies in
-    its rear focal plane, where 1 mm stands for 1 mrad. The ideal lens maps angles to heights
+    its rear focal plane, where 1 mm means 1 mrad. The ideal lens maps angles to heights
     without distortion. All analyses then work unchanged if heights are read as angles in mrad.
     Moving the second sensor by 1 mm is a vergence of 1e-3 dioptre.
 

@@ -18,8 +18,11 @@ from .figures import FIELD_COLOURS
 def longitudinal(
     axes: Axes, found: AxialColour, heights: ArrayLike, wavelengths: ArrayLike
 ) -> Axes:
-    """Longitudinal spherical aberration: foci, mm from the sensor, of rays through heights (N,) on
-    the stop in W wavelengths, with the paraxial foci as points."""
+    """Longitudinal spherical aberration: foci, mm from the sensor, with paraxial foci as points.
+
+    found: result of `axial_colour` for N heights in W wavelengths.
+    heights: (N,), on the stop, in units of its semi-diameter. wavelengths: (W,), um.
+    """
     rows = zip(np.asarray(found.real), np.asarray(found.paraxial), coloured(wavelengths))
     for real, paraxial, style in rows:
         axes.plot(np.where(np.isfinite(real), real, np.nan), np.asarray(heights), **style)
@@ -30,7 +33,10 @@ def longitudinal(
 
 
 def focal_shift(axes: Axes, found: AxialColour, wavelengths: ArrayLike, reference: float) -> Axes:
-    """Chromatic focal shift: paraxial foci over wavelength (W,), less that of a reference, um."""
+    """Chromatic focal shift, um: paraxial foci over wavelength, minus the focus of a reference.
+
+    found: result of `axial_colour`. wavelengths: (W,), um. reference: a wavelength, um.
+    """
     waves, foci = np.asarray(wavelengths, float), 1e3 * np.asarray(found.paraxial)
     axes.plot(foci - np.interp(reference, waves, foci), waves, color="black")
     axes.axhline(reference, color="0.7", linewidth=0.6, zorder=0)
@@ -42,8 +48,12 @@ def focal_shift(axes: Axes, found: AxialColour, wavelengths: ArrayLike, referenc
 def mtf_through_focus(
     axes: Axes, focus: ArrayLike, curves: ArrayLike, names: Sequence[str], frequency: float
 ) -> Axes:
-    """MTF (F, Z, 2) of fields at one frequency, cycles/mm, over the shift (Z,) of the sensor, mm:
-    solid lines are tangential, dashed sagittal."""
+    """MTF at one frequency over the position of the sensor: solid lines are tangential, dashed
+    sagittal.
+
+    focus: (Z,), shift of the sensor, mm. curves: (F, Z, 2), MTF.
+    names: F labels of the fields. frequency: cycles/mm.
+    """
     styles = zip(names, itertools.cycle(FIELD_COLOURS))
     contrast(axes, focus, np.asarray(curves).swapaxes(1, 2), styles)
     axes.axvline(0, color="0.7", linewidth=0.6, zorder=0)
@@ -55,8 +65,11 @@ def mtf_through_focus(
 
 
 def grid_distortion(axes: Axes, found: Distortion, side: int, wavelength: int = 0) -> Axes:
-    """The image of a grid of side x side fields: real chief rays as lines, the ideal image grey,
-    mm. wavelength: index of it."""
+    """The image of a square grid of fields, mm: real chief rays black, the ideal image grey.
+
+    found: result of `distortion` for side x side fields, row by row.
+    side: number of fields along a side. wavelength: index of the wavelength.
+    """
     for points, colour in ((found.ideal, "0.7"), (found.real, "black")):
         grid = np.asarray(points)[:, wavelength].reshape(side, side, 2)
         grid = np.where(np.isfinite(grid), grid, np.nan)
@@ -70,8 +83,11 @@ def grid_distortion(axes: Axes, found: Distortion, side: int, wavelength: int = 
 
 
 def footprints(axes: Axes, hits: ArrayLike, semi_diameter: float) -> Axes:
-    """Where the rays of F fields meet a surface, (F, Q, 2), mm, inf for those that do not arrive,
-    and its clear aperture, inf for none."""
+    """Hits of the rays of F fields on a surface, with its clear aperture.
+
+    hits: (F, Q, 2), mm from the vertex; inf for rays that do not arrive.
+    semi_diameter: radius of the clear aperture, mm; inf for none.
+    """
     for points, hue in zip(np.asarray(hits), itertools.cycle(FIELD_COLOURS)):
         good = np.all(np.isfinite(points), axis=-1)
         axes.plot(*points[good].T, ".", color=hue, markersize=1)
@@ -83,8 +99,10 @@ def footprints(axes: Axes, hits: ArrayLike, semi_diameter: float) -> Axes:
 
 
 def wavefront_map(axes: Axes, opd: ArrayLike) -> Axes:
-    """Path differences (N, N), waves, over the stop, nan where no light passes, with their peak to
-    valley and RMS."""
+    """Path differences over the stop, with their peak to valley and RMS.
+
+    opd: (N, N) [y, x], waves; nan where no light passes.
+    """
     waves = np.asarray(opd)
     picture = axes.imshow(waves, origin="lower", extent=(-1, 1, -1, 1), cmap="viridis")
     axes.figure.colorbar(picture, ax=axes, shrink=0.8, label="OPD (waves)")
@@ -97,7 +115,10 @@ def wavefront_map(axes: Axes, opd: ArrayLike) -> Axes:
 
 
 def point_spread(axes: Axes, kernel: ArrayLike, pixel: float) -> Axes:
-    """A PSF (N, N) on pixels of a side in mm, relative to its peak, um about its centre."""
+    """A PSF relative to its peak, over um about its centre.
+
+    kernel: (N, N) [y, x]. pixel: side of a pixel, mm.
+    """
     light = np.asarray(kernel)
     half = 0.5e3 * pixel * len(light)
     peak = np.max(light) or 1.0

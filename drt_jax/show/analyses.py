@@ -1,4 +1,5 @@
-"""Plots of analyses over the field. Each function draws a result of `drt_jax` on axes.
+"""Plots of analyses over the field. Each function draws a result of `drt_jax` on the given axes,
+and returns the axes.
 
 wavelengths (W,) in um set the colour of each curve: blue for the shortest, red for the longest.
 fields (F,) are angles in radians. Values that are not finite are left out.
@@ -56,8 +57,11 @@ def legend(axes: Axes) -> None:
 
 
 def spots(axes: Axes, found: Spots, field: int, wavelengths: ArrayLike, half: float = 0) -> Axes:
-    """The spot of one of the fields about its centroid, in um, with the Airy circle.
+    """The spot of one field about its centroid, in um, with the Airy circle.
 
+    found: result of `spot_diagram` for F fields in W wavelengths.
+    field: index of the field.
+    wavelengths: (W,), um.
     half: half the width of the plot, um; 0 takes the radius of the spot, at most five RMS radii.
         If a ray lies farther out, the label gives its distance.
     """
@@ -89,8 +93,14 @@ def fan(
     sagittal: bool = False,
     half: float = 0,
 ) -> Axes:
-    """Transverse ray errors of one field, um, along the y axis of the stop or, with `sagittal`,
-    along the x axis. half: half the height of the plot, um; 0 fits it to the curves."""
+    """Transverse ray errors of one field, um, along the y axis of the stop.
+
+    found: result of `ray_fans` for F fields in W wavelengths.
+    field: index of the field.
+    wavelengths: (W,), um.
+    sagittal: True for the x axis of the stop.
+    half: half the height of the plot, um; 0 fits it to the curves.
+    """
     errors, component = (found.sagittal, 0) if sagittal else (found.tangential, 1)
     curves = 1e3 * np.asarray(errors)[field, ..., component]
     name = f"ray error $e_{'yx'[sagittal]}$ (um)"
@@ -105,7 +115,7 @@ def path_fan(
     sagittal: bool = False,
     half: float = 0,
 ) -> Axes:
-    """Optical path differences of one field, waves; arguments as in `fan`, half in waves."""
+    """Optical path differences of one field, waves. Arguments as in `fan`, but `half` in waves."""
     curves = np.asarray(found.sagittal_path if sagittal else found.tangential_path)[field]
     name = f"OPD along {'yx'[sagittal]} (waves)"
     return _over_pupil(axes, found.pupil, curves, wavelengths, name, half)
@@ -114,12 +124,18 @@ def path_fan(
 def field_curvature(
     axes: Axes, found: FieldCurvature, fields: ArrayLike, wavelengths: ArrayLike
 ) -> Axes:
-    """Foci over the field, mm from the sensor: solid lines are tangential, dashed sagittal."""
+    """Foci over the field, mm from the sensor: solid lines are tangential, dashed sagittal.
+
+    found: result of `field_curvature`, (F, W). fields: (F,), radians. wavelengths: (W,), um.
+    """
     return _over_field(axes, found, fields, wavelengths, "field curvature (mm), T solid, S dashed")
 
 
 def distortion(axes: Axes, found: Distortion, fields: ArrayLike, wavelengths: ArrayLike) -> Axes:
-    """Distortion over the field in per cent."""
+    """Distortion over the field in per cent.
+
+    found: result of `distortion`, (F, W). fields: (F,), radians. wavelengths: (W,), um.
+    """
     percent = 100 * np.asarray(found.relative)
     return _over_field(axes, [percent], fields, wavelengths, "distortion (%)")
 
@@ -127,8 +143,11 @@ def distortion(axes: Axes, found: Distortion, fields: ArrayLike, wavelengths: Ar
 def lateral_colour(
     axes: Axes, found: ArrayLike, fields: ArrayLike, wavelengths: ArrayLike, airy: float = 0
 ) -> Axes:
-    """Lateral colour along y over the field, um. found: (F, W, 2) mm. airy: radius of the shaded
-    band, um."""
+    """Lateral colour along y over the field, um.
+
+    found: result of `lateral_colour`, (F, W, 2), mm. fields: (F,), radians. wavelengths: (W,), um.
+    airy: half the width of the shaded band, such as the Airy radius, um; 0 for none.
+    """
     if 0 < airy < np.inf:
         axes.axvspan(-airy, airy, color="0.92")
     along_y = 1e3 * np.asarray(found)[..., 1]
@@ -136,7 +155,7 @@ def lateral_colour(
 
 
 def illumination(axes: Axes, light: ArrayLike, throughput: ArrayLike, fields: ArrayLike) -> Axes:
-    """Relative illumination and throughput (F,) over the field."""
+    """Relative illumination and throughput, (F,) each, over the fields (F,), radians."""
     axes.plot(_degrees(fields), light, color="black", label="relative illumination")
     axes.plot(_degrees(fields), throughput, "--", color="tab:grey", label="throughput")
     axes.set(xlim=_range(fields), ylim=(0, 1.05), xlabel="field (degrees)")
@@ -153,8 +172,13 @@ def mtf(
     names: Sequence[str],
     hues: Sequence[str] = FIELD_COLOURS,
 ) -> Axes:
-    """MTF (F, 2, N) over frequencies (N,) in cycles/mm, with the diffraction limit (N,): solid
-    lines are tangential, dashed sagittal. hues: colours of the fields."""
+    """MTF over frequency: solid lines are tangential, dashed sagittal, dotted the limit.
+
+    frequencies: (N,), cycles/mm.
+    curves: (F, 2, N), such as `Transfer.mtf`.
+    limit: (N,), MTF without aberrations.
+    names: F labels of the fields. hues: their colours.
+    """
     axes.plot(frequencies, limit, ":", color="black", label="limit")
     contrast(axes, frequencies, np.asarray(curves), zip(names, itertools.cycle(hues)))
     axes.set(xlim=(0, np.max(np.asarray(frequencies))), xlabel="spatial frequency (cycles/mm)")
@@ -176,8 +200,10 @@ def contrast(
 def mtf_over_field(
     axes: Axes, fields: ArrayLike, curves: ArrayLike, frequencies: Sequence[float]
 ) -> Axes:
-    """MTF (F, 2, N) over the field at N frequencies in cycles/mm, black to grey: solid lines are
-    tangential, dashed sagittal."""
+    """MTF over the field, black to grey: solid lines are tangential, dashed sagittal.
+
+    fields: (F,), radians. curves: (F, 2, N). frequencies: (N,), cycles/mm.
+    """
     most = max(len(frequencies) - 1, 1)
     styles = [(f"{line:.4g} cycles/mm", str(0.6 * k / most)) for k, line in enumerate(frequencies)]
     contrast(axes, _degrees(fields), np.asarray(curves).T, styles)
@@ -187,7 +213,10 @@ def mtf_over_field(
 
 def seidel(axes: Axes, found: ThirdOrder, wavelength: int = 0) -> Axes:
     """Third-order transverse aberrations of each surface and their sums, mm, as bars on one scale,
-    which the label gives. wavelength: index of it."""
+    which the label gives.
+
+    found: result of `third_order`. wavelength: index of the wavelength.
+    """
     kinds = ThirdOrder._fields[:-1]  # those that are lengths
     parts = np.stack([np.asarray(part)[:, wavelength] for part in found[:-1]])
     bars = np.concatenate([parts, parts.sum(axis=1, keepdims=True)], axis=1)
@@ -209,8 +238,12 @@ def encircled_energy(
     hues: Sequence[str] = FIELD_COLOURS,
     airy: float = 0,
 ) -> Axes:
-    """Encircled energy: the fraction of the light (F, N) within circles of radii (N,) mm. hues:
-    colours of the fields. airy: radius of the marked line, mm."""
+    """Encircled energy: the fraction of the light within circles.
+
+    radii: (N,), mm. parts: (F, N), fractions.
+    names: F labels of the fields. hues: their colours.
+    airy: radius at which a line is drawn, such as the Airy radius, mm; 0 for none.
+    """
     places = 1e3 * np.asarray(radii, float)
     for part, name, hue in zip(np.asarray(parts), names, itertools.cycle(hues)):
         axes.plot(places, part, color=hue, label=name)
@@ -225,8 +258,11 @@ def encircled_energy(
 def gaussian_error(
     axes: Axes, found: GaussianError, fields: ArrayLike, distances: ArrayLike
 ) -> Axes:
-    """The error of Gaussian kernels (D, F) over distance (D,) mm and field (F,), as numbers and
-    colours: the light in wrong pixels, in per cent, which is half of `misplaced`."""
+    """The error of Gaussian kernels over distance and field, as numbers and colours: the light in
+    wrong pixels, in per cent, which is half of `misplaced`.
+
+    found: result of `gaussian_error`, (D, F). fields: (F,), radians. distances: (D,), mm.
+    """
     share = 50 * np.asarray(found.misplaced)
     axes.imshow(share, vmin=0, vmax=100, cmap="magma_r", aspect="auto", origin="lower")
     for place, value in np.ndenumerate(share):

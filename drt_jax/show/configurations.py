@@ -1,4 +1,4 @@
-"""Several configurations of one lens under each other, and a table of their numbers."""
+"""Drawings of the configurations of one lens, below each other, and a table of their numbers."""
 
 import dataclasses
 from collections.abc import Iterator, Sequence
@@ -19,7 +19,7 @@ from .layout import beam_of, draw, lens_drawing
 def configurations(
     axes: Sequence[Axes], lenses: Sequence[Lens], scenes: Sequence[Scene], half: bool = False
 ) -> Sequence[Axes]:
-    """Draw the configurations of a lens at one scale, their sensors in line.
+    """Draw the configurations of a lens at one scale, with their sensors aligned.
 
     axes: C axes, such as those of `new(C)`.
     lenses, scenes: C of each; fields along y. A surface without an aperture is as wide as the beams

@@ -1,4 +1,4 @@
-"""`python -m drt_jax glass NAME`: data of a glass of the table, its neighbours, the glass map."""
+"""`python -m drt_jax glass NAME`: data of a glass, its neighbours, and the glass map."""
 
 import argparse
 import pathlib

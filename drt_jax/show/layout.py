@@ -237,8 +237,8 @@ class Beam(NamedTuple):
 
 
 def beam_of(lens: Lens, scene: Scene) -> Beam:
-    """The beam of one object point, its spot in the middle wavelength. What clips and fails is that
-    of all wavelengths."""
+    """The beam of one object point: its spot in the middle wavelength, and the clipping and
+    failures in all wavelengths."""
     scene, middle = checked_scene(lens, scene), scene.reference(None)
     rim = np.linspace(0, 2 * np.pi, _RIM)
     pupil = np.concatenate([hexapolar(_RINGS)[0], np.stack([np.sin(rim), np.cos(rim)], axis=-1)])

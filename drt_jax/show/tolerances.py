@@ -1,4 +1,4 @@
-"""Plots of tolerances: what each error does, and how many lenses are as good as asked for."""
+"""Plots of tolerances: the effect of each error, and the yield over a level of the criterion."""
 
 from collections.abc import Mapping
 
@@ -13,8 +13,8 @@ _LARGEST = 2.0  # bars are cut at this many times the largest change after compe
 
 
 def sensitivity(axes: Axes, table: Sensitivity, count: int = 14) -> Axes:
-    """The errors that change a criterion most after compensation, largest first: the worse sign,
-    and pale behind it without compensation, cut where it does not fit.
+    """Bars of the errors that change a criterion most after compensation, the largest first, for
+    the worse sign. Pale bars behind them are the changes without compensation, cut if too long.
 
     count: largest number of errors.
     """
@@ -47,7 +47,7 @@ def yields(axes: Axes, values: Mapping[str, ArrayLike], label: str, target: floa
     values: for each name of a curve the values (K,) of lenses as built, in the unit of the plot.
         Lenses that fail, with infinite values, count as worse than all others.
     label: what the values are, with their unit.
-    target: of the criterion; good is what is near it.
+    target: target of the criterion; a lens is better if its criterion is nearer to it.
     """
     for name, given in values.items():
         each = np.ravel(np.asarray(given, float))

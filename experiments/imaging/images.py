@@ -4,7 +4,7 @@ Kernels by rays and by waves with rising numbers of cells, and Gaussian ones, fo
 field. `error` is against the limit of the model: a histogram of very many rays, or waves with very
 many cells; `off` is against the limit of waves. Both are sums of absolute differences of all
 pixels, of the worst wavelength. Optiland's FFT PSF and prysm's matrix Fourier transform are
-compared with the limit of waves at the middle wavelength; prysm traces nothing, but gets the pupil.
+compared with the limit of waves at the middle wavelength; prysm traces no rays and gets our pupil.
 Writes results.json: `kernels` hold `lens`, `model`, `cells`, `value_s`, `gradient_s` (of a mean
 over the kernel, by every number of the lens), `error`, `off`; `peers`; `views`: the light outside
 of the kernel, the noise of the histogram, the rays that arrive, seconds of 9 x 9 fields, MTF and

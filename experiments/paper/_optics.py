@@ -22,7 +22,7 @@ from ._common import Colours, require, within
 from .runs.config import ConfigError
 
 # Kinds of trained numbers. Tilts and decentres would break the symmetry of the pupil rule;
-# semi-diameters would shrink to nothing, because the loss does not count light.
+# semi-diameters would shrink to 0, because the loss does not depend on the light.
 KINDS = ("sensor", "curvature", "conic", "coefficients", "thickness")
 _RINGS = 4  # rings of rays in `Trained.scale`
 
@@ -130,14 +130,14 @@ class Trained:
         return blur if places else model
 
     def scale(self, scene: Scene, distance: float) -> dict[str, float]:
-        """Change of each number, by name and in the unit of the lens, that counts as 1 mm of the
-        sensor; 0 for a sensor that is not trained.
+        """Change of each number, by name and in the unit of the lens, that is equivalent to 1 mm of
+        the sensor; 0 for a sensor that is not trained.
 
         It changes the ray deviations from the centroid as much as 1 mm of the sensor does (root
-        mean square over pupil and wavelengths, to first order, at the start), so that one rate in
-        mm serves all units and no number spoils the focus faster. It has at most as many typical
-        steps of a design as 1 mm of the sensor: the conic of a nearly flat surface would change by
-        thousands.
+        mean square over pupil and wavelengths, to first order, at the start). So one rate in mm
+        suits all units, and no number changes the focus faster than the sensor. The change is at
+        most as many typical steps of a design as 1 mm of the sensor is; without this bound the
+        conic of a nearly flat surface would change by thousands.
         """
         pupil = tuple(jnp.asarray(hexapolar(_RINGS)[0].T, self.lens.curvature.dtype))
 

@@ -119,7 +119,7 @@ def least(rows: list[dict[str, Any]], error: float) -> float:
 
 
 def faster(rows: list[dict[str, Any]], own: list[dict[str, Any]]) -> str:
-    """The ranges of errors that a program reaches in less time than we, as text."""
+    """The ranges of errors that a program reaches in less time than `drt_jax`, as text."""
     errors = sorted({row["error"] for row in (*rows, *own)}, reverse=True)
     runs = itertools.groupby(errors, lambda error: least(rows, error) < least(own, error))
     won = [[f"{error:.0e}" for error in run] for wins, run in runs if wins]
@@ -128,7 +128,7 @@ def faster(rows: list[dict[str, Any]], own: list[dict[str, Any]]) -> str:
 
 def summary(rows: list[dict[str, Any]]) -> str:
     """Table of rows of `rows_of`: least error and times to some errors by task and program, and the
-    errors at which it beats us."""
+    errors at which the program is faster than `drt_jax`."""
     lines = []
     for (task,), some in _common.grouped(rows, "task").items():
         groups = _common.grouped(some, "program")

@@ -104,7 +104,7 @@ def _ours(at: At, sizes: Profile, clipped: bool, error: Callable) -> Made:
 
 
 def sweep(made: Made) -> Made:
-    """As far as a sweep goes, see above."""
+    """The calls of a sweep until it ends, see the module docstring."""
     before = np.inf
     for call, error in made:
         yield call, error
@@ -117,8 +117,8 @@ def sweep(made: Made) -> Made:
 
 
 def attempt(sweeps: Sequence[Made]) -> tuple[list[list[Callable]], Row]:
-    """By tolerance, the first call of each sweep that keeps it; and a row of what came of it all:
-    `error`, the least, `first_s`, and `why` none keeps the first tolerance."""
+    """By tolerance, the first call of each sweep that meets it; and a row of results: `error`, the
+    least error, `first_s`, and `why` no call meets the first tolerance."""
     calls: list[list[Callable]] = [[] for _ in TOLERANCES]
     start, least, why = time.perf_counter(), np.inf, ""
     for made in sweeps:

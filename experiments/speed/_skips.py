@@ -89,7 +89,7 @@ def program(
 
     error: function of what the call returns. given: arguments of the function.
     """
-    jax.clear_caches()  # neither way finds a trace that the other left
+    jax.clear_caches()  # neither way uses a trace that the other has cached
     options = known_options(LARGE)  # as the package has itself
     call, measured = _work.compiled(jax.jit(function, compiler_options=options), *given)
     return Way(words, call, error(call()), compile_s=measured["compile_s"], **known)

@@ -42,7 +42,7 @@ class Waves:
 
 
 def focused(lens: Lens, field: float, wavelength: float, sizes: Waves) -> Shot:
-    """The kernel of a lens that is focused anew, at infinity."""
+    """The kernel of a lens that is refocused to infinity."""
     waves = np.array([wavelength])
     first = drt_jax.first_order(lens, math.inf, waves)
     lens = dataclasses.replace(lens, sensor=first.image_distance[0])

@@ -3,9 +3,10 @@
 Calls alternate, and their medians are compared. Spots are curves: each program is swept over its
 own samplings, also with our nodes. Errors are relative: of the RMS spot radius sigma, or the worse
 of sigma and its derivatives by curvatures and thicknesses at fixed stop points, against an integral
-over a sequential trace by Snell's law. Optiland's rays that we launched stay at their launch, and
-rays of the paraxial pupil are other rays: their derivatives are right, but of other quantities, and
-differ by 0.2 and 3 %. Peers are an extra, `pip install -e '.[peers]'`; the row of a missing one
+over a sequential trace by Snell's law. Optiland's derivatives keep the launch of our rays fixed,
+and rays through the paraxial pupil differ from rays through the stop. Such derivatives are correct,
+but of other quantities, and differ by 0.2 and 3 %. Peers are an extra, `pip install -e '.[peers]'`;
+the row of a missing one
 says so. Writes results.json: `curves` hold `task`, `program`, `sampling`, `size` (rays a
 wavelength), `error`, `quartiles_s`, `repeats`; `missing`, why a program has none; `rows` hold
 `task`, `ours_s`, `peer`, `peer_s`, `ratio` (theirs / ours), `ours_error`, `peer_error`,
@@ -164,8 +165,8 @@ def spot_curves(config: Config, gradient: bool) -> dict[str, Any]:
 
 def disturbed_curves(config: Config) -> dict[str, Any]:
     """Curves of sigma of many disturbed lenses, (V, 1). Curvatures are off by 0.1 % and distances
-    by 0.02 mm, one standard deviation. Other programs get their lenses ready before the clock
-    starts."""
+    by 0.02 mm, one standard deviation. The lenses of other programs are made before the time is
+    measured."""
     lens, *given = config.scene
     values = flatten(lens)
     sizes = jnp.concatenate([1e-3 * values[: lens.count], jnp.full(lens.count, 0.02)])

@@ -1,4 +1,4 @@
-"""What the arms of a joint design share: lens, camera, the model that judges, training steps."""
+"""What the arms of a joint design share: lens, camera, image model of the evaluation, steps."""
 
 import dataclasses
 import functools
@@ -30,10 +30,11 @@ _RINGS, _EDGE, _DEPTHS, _ORDER = 4, 0.05, 5, 6
 # Largest side of the spectra behind filters, pixels; most Jacobians of least squares on their
 # error.
 _SIDE, _JACOBIANS = 64, 60
-# Light outside of a kernel that the spoilt lens may have.
+# Largest fraction of light outside of a kernel for the spoilt lens.
 _LOST = 0.2
-# Lenses as built that training draws from, and their seed; the judge takes the next one. Lenses as
-# built of least squares. Order of the pupil rule of those and of the metric of rays.
+# Number of lenses as built from which training draws, and their seed; the evaluation uses the next
+# seed. Number of lenses as built for least squares. Order of the pupil rule for these and for the
+# metric of ray steps.
 _BUILDS, SEED = 4096, 1
 _FEW, _COARSE = 48, 4
 # Golden angle, radians.
@@ -45,10 +46,10 @@ class Arm(NamedTuple):
 
     title: its name in tables and figures.
     begins: lens at the start, see `Setup.finished`.
-    moves: what training changes of the lens: "all" variables, the "sensor", or "nothing".
-    steps: of the lens: "adam", "cosine" (Adam, with rates that fall as a cosine), or "rays"
-        (`design.RaySteps`).
-    frozen: True for the network that the arm `spots` has trained, which stays.
+    moves: part of the lens that is trained: "all" variables, the "sensor", or "nothing".
+    steps: optimiser of the lens: "adam", "cosine" (Adam, with rates that fall as a cosine), or
+        "rays" (`design.RaySteps`).
+    frozen: True to keep the network that the arm `spots` has trained.
     as_built: True for a lens with errors of its own in each step.
     longer: factor of the number of steps.
     """
@@ -91,7 +92,7 @@ ARMS = {
         as_built=True
     ),
 }  # fmt: skip
-# Of each finished lens the one that it begins with.
+# For each optimised lens the lens that its least squares start from.
 _BEFORE = {"spots": "spoilt", "mtf": "spots", "built": "spots", "stopped": "spots"}
 _BEFORE |= {"freed": "stopped"}
 
@@ -196,11 +197,11 @@ class Setup:
         return design.Problem.from_variables(variables, both, scene, order)
 
     def finished(self, name: str, once: Callable[[str, Callable[[], list]], list]) -> Array:
-        """The vector of a lens at the start of an arm: "spoilt", or what least squares make of it:
-        on "spots", on "mtf", on spots of lenses as "built", on spots with the best stop ("stopped":
-        the one with the least error of the filter), the same with all variables ("freed"), and on
-        the error of the "filter".
-        once: keeps a result, see `Run.once`."""
+        """The vector of a lens at the start of an arm: "spoilt", or a result of least squares: on
+        "spots", on "mtf", on spots of lenses as "built", on spots with the best stop ("stopped":
+        the stop with the smallest error of the filter), the same with all variables ("freed"), and
+        on the error of the "filter".
+        once: function that keeps a result, see `Run.once`."""
         if name not in self._finished:
             best = "freed" if self.config.stops else "spots"
             before = self.finished(_BEFORE.get(name, best), once)
@@ -213,7 +214,7 @@ class Setup:
         return self._finished[name]
 
     def _finish(self, name: str, lens: Lens) -> Array:
-        """The vector of a lens that least squares have finished, see `finished`."""
+        """The vector of a lens after least squares, see `finished`."""
         held = () if name == "freed" else self.config.held
         if name == "filter":
             return self._best(self.filtered, lens, _JACOBIANS)
@@ -233,12 +234,13 @@ class Setup:
         return found[int(np.argmax(reached))]
 
     def _best(self, problem: design.Problem, lens: Lens, steps: int = 100) -> Array:
-        """The vector of a lens that least squares have finished on a problem of it."""
+        """The vector of a lens after least squares on a problem."""
         found = design.optimise(problem, problem.variables.vector(lens), steps)
         return self.variables.vector(problem.variables.lens_of(found.vector))
 
     def stopped(self, lens: Lens, held: tuple[str, ...], stop: float) -> Array:
-        """The vector of a lens finished on spots, with a factor of its entrance pupil."""
+        """The vector of a lens after least squares on spots, with a factor of its entrance
+        pupil."""
         return self._best(self._problem(self._variables(lens, held, stop), "spot"), lens)
 
     @functools.cached_property
@@ -260,7 +262,7 @@ class Setup:
         fields = np.array([[1e-4, 1e-4], [0.5, 0.5], [0.0, 1.0]]) * self.field
         given = lens, Scene.grid(fields, sorted(set(self.depths)), self.waves), *self.pixels
         with warnings.catch_warnings():
-            warnings.filterwarnings("ignore", "size: ")  # light beside kernels is judged below
+            warnings.filterwarnings("ignore", "size: ")  # light outside is checked below
             try:
                 model = drt_jax.converge(drt_jax.psf, *given, "rays", self.config.camera.tolerance)
                 if self.config.camera.kind == "waves":
@@ -268,7 +270,7 @@ class Setup:
             except ValueError as error:
                 raise ConfigError(f"field_deg: {error}") from error
             worst = float(np.max(drt_jax.psf(*given, sampling=model).outside))
-        lost = f"{100 * worst:.0f} % of the light of the spoilt lens falls beside a kernel"
+        lost = f"{100 * worst:.0f} % of the light of the spoilt lens falls outside a kernel"
         remedy = "give a larger one, larger pixels, or spoil the lens less"
         _common.require(worst <= _LOST, f"camera.kernel: {lost} of {size} pixels: {remedy}")
         return model
@@ -315,7 +317,7 @@ class Setup:
 
     @functools.cached_property
     def judged(self) -> ObjectPoints:
-        """The points of the judge: rings of equal area at all depths."""
+        """The object points of the evaluation: rings of equal area at all depths."""
         judge = self.config.judge
         ring = (np.arange(judge.rings) + 0.5) / judge.rings
         angle = _TURN * np.arange(judge.rings)
@@ -337,7 +339,7 @@ class Setup:
     def _step(
         self, stays: bool, steps: str, frozen: bool, as_built: bool
     ) -> tuple[Callable, Callable]:
-        """(init, step); stays: True for a lens that stays, the others as in `Arm`."""
+        """(init, step). stays: True if the lens is not trained; the others as in `Arm`."""
         setting, mesh = self.config.train, self.mesh
         rates: dict[str, Any] = {"network": setting.network_rate, "optics": 0.0}
         if self.config.taps:
@@ -352,7 +354,7 @@ class Setup:
                 lens = lambda k: self.rates * falls(k.astype(self.rates.dtype))  # noqa: E731
             rates["optics"] = {"lens": lens, "moves": 0.0}
 
-        # Neither derivatives nor limits of a lens or a network that stays.
+        # A lens or network that is not trained needs neither derivatives nor limits.
         def points(optics: Any, seen: ObjectPoints) -> tuple[Array, Array]:
             return self.points(jax.lax.stop_gradient(optics) if stays else optics, seen)
 
@@ -402,7 +404,7 @@ class Setup:
         return jax.jit(taps)
 
     def filter_db(self, vector: Array) -> float | None:
-        """PSNR behind the best filter by its closed-form error, dB; None without a filter."""
+        """PSNR after the best filter, from its closed-form error, dB; None without a filter."""
         error = float(self.filtered.merit(vector)) if self.config.taps else None
         return error and -10 * math.log10(error / len(self.waves))
 

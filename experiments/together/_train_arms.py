@@ -1,4 +1,4 @@
-"""The arms of a joint design: least squares, training, and what another model says of them."""
+"""The arms of a joint design: least squares, training, and evaluation by another image model."""
 
 import dataclasses
 import itertools
@@ -35,7 +35,7 @@ Trained = dict[tuple[str, int], Any]
 
 
 def run(config: Any, run: Run) -> dict[str, Any]:
-    """Finishes the lenses, trains and judges all arms."""
+    """Optimises the lenses, then trains and evaluates all arms."""
     side = config.train.patch + config.camera.kernel - 1 + max(config.taps - 1, 0)
     others = _others(config.judge.others, side, run)
     setup = Setup(config, _training.read_patches(config.data, side, 0, run.folder))
@@ -91,7 +91,7 @@ def run(config: Any, run: Run) -> dict[str, Any]:
 
 
 def _map(setup: Setup, run: Run) -> list[dict[str, Any]]:
-    """PSNR behind the best filter and f-number of finished lenses, for each scene of the map."""
+    """PSNR after the best filter and f-number of optimised lenses, for each scene of the map."""
     rows, asked = [], setup.config.map
     for near, noise in itertools.product(asked.near_m, asked.noise):
         depths = near, setup.config.depth_m[1]
@@ -114,8 +114,8 @@ def _map(setup: Setup, run: Run) -> list[dict[str, Any]]:
 
 
 def _plates(setup: Setup, factors: Sequence[float]) -> list[dict[str, float]]:
-    """PSNR behind the best filter, for each stop: of the lens that least squares on spots finish
-    without the coefficients of its file, and of that with these times each factor."""
+    """PSNR after the best filter, for each stop and factor. The lens is optimised for spots without
+    the coefficients of its file; then these coefficients times each factor are added."""
     spoilt, rows = setup.lens_of(setup.spoilt), []
     bare = dataclasses.replace(spoilt, coefficients=0 * spoilt.coefficients)
     for stop in setup.config.stops:
@@ -155,7 +155,7 @@ def _train(
 
 
 def _save(setup: Setup, run: Run, name: str, vector: Array) -> None:
-    """Writes a lens with apertures that follow the light."""
+    """Writes a lens with apertures fitted to its beams."""
     lens = design.fit_apertures(setup.spots, setup.variables.lens_of(vector))
     drt_jax.save_lens(lens, run.folder / "lenses" / f"{name}.yaml")
 
@@ -178,7 +178,7 @@ def _others(folder: str, side: int, run: Run) -> dict[str, np.ndarray]:
 def _judged(
     setup: Setup, imager: Callable, parameters: Any, test: dict[str, np.ndarray]
 ) -> dict[str, Any]:
-    """Quality of the images of an arm, by the judge; of other images than the first PSNR alone."""
+    """Quality of the images of an arm in the evaluation; PSNR alone for the other images."""
     count, found = len(setup.judged.fields), {}
     for name, every in test.items():
         patches = _training.thinned(every, setup.config.judge.patches * count)
@@ -188,7 +188,7 @@ def _judged(
 
 
 def _one_each(setup: Setup, patches: np.ndarray) -> np.ndarray:
-    """A patch for each point of the judge; patches are repeated if they are too few."""
+    """A patch for each point of the evaluation; patches are repeated if there are too few."""
     return np.resize(patches, (len(setup.judged.fields), *patches.shape[1:]))
 
 
@@ -222,13 +222,13 @@ def _photograph(setup: Setup, side: int, trained: Trained, rows: list[dict]) -> 
 
 
 def _built_lenses(setup: Setup) -> np.ndarray:
-    """Deviations of the lenses as built of the judge."""
+    """Deviations of the lenses as built that are used in the evaluation."""
     return design.draw_perturbations(setup.built, setup.config.judge.builds, SEED + 1)
 
 
 def _as_built(setup: Setup, run: Run, trained: Trained, others: np.ndarray | None) -> list[dict]:
-    """PSNR of lenses as built, of arms that begin with a lens whose spots are finished, by rays at
-    the points of the judge; with prefix `others_` of other photographs."""
+    """PSNR of lenses as built, for arms that start from a lens of least squares, by rays at the
+    points of the evaluation; with the prefix `others_` for other photographs."""
     imager = jax.jit(FieldImager(setup.points, setup.restore).__call__)
     rows = []
     for (arm, seed), parameters in trained.items():
@@ -246,7 +246,7 @@ def _as_built(setup: Setup, run: Run, trained: Trained, others: np.ndarray | Non
 def _decibels(
     setup: Setup, imager: Callable, parameters: Any, patches: np.ndarray, job: str
 ) -> dict[str, Any]:
-    """PSNR of the lens as designed; of lenses as built each, the mean, and the 10th percentile."""
+    """PSNR of the lens as designed; and of lenses as built: each, mean and 10th percentile."""
     table = _built_lenses(setup)
     patches = _training.thinned(patches, len(setup.judged.fields))
     patches, found = _one_each(setup, patches), []

@@ -1,18 +1,24 @@
-"""Design a lens and its network together, over field and depth, against a finished lens.
+"""Design a lens and its network together, over field and depth, and compare with least squares.
 
-Arms begin with the same spoilt lens: `focus` trains its sensor and the network; `spots` and `mtf`
-finish the lens by least squares, then train the network, `longer` with twice the steps; `joint`
-trains all variables and the network from the spoilt lens, `joint_from_spots` from the finished one,
-both by Adam; `cosine_from_spots` with rates that fall; `rays` and `rays_from_spots` are `joint` and
-`joint_from_spots` with steps that are measured by rays, `rays_from_mtf` begins with the lens of
-`mtf`; `frozen` trains the lens of `spots` through its network; `tolerant` is `rays_from_spots` with
-lenses as built, `built_network` is `spots` with them; `built_spots` finishes the lens on spots of
-lenses as built, and `tolerant_from_built` goes on jointly. With `taps`, the network begins with the
-best linear filter of its lens: `stopped` is `spots` with the best of `stops`, `freed` also moves
-what `held` keeps; `filter` finishes the lens on the error of that filter, and `rays_from_filter`
-goes on jointly. Every arm has the same data, steps and starts of the network. Another model of the
-picture judges them: waves, more fields, more wavelengths, images that no arm has seen. Writes
-lenses/ARM SEED.yaml.
+An arm is one way to design lens and network. All arms start from the same spoilt lens:
+
+- `focus` trains the sensor position and the network;
+- `spots` and `mtf` optimise the lens by least squares, then train the network; `longer` is `spots`
+  with twice the training steps;
+- `joint` trains all variables and the network from the spoilt lens, `joint_from_spots` from the
+  lens of `spots`, both by Adam; `cosine_from_spots` has decreasing rates;
+- `rays` and `rays_from_spots` are `joint` and `joint_from_spots` with ray steps
+  (`design.RaySteps`); `rays_from_mtf` starts from the lens of `mtf`;
+- `frozen` trains the lens of `spots` with the network of `spots` fixed;
+- `tolerant` is `rays_from_spots` with lenses as built, `built_network` is `spots` with lenses as
+  built; `built_spots` optimises the lens for spots of lenses as built, and `tolerant_from_built`
+  continues jointly from there.
+
+With `taps`, the network starts with the best linear filter of its lens: `stopped` is `spots` with
+the best of `stops`, `freed` also varies the kinds in `held`; `filter` optimises the lens for the
+error of the filter, and `rays_from_filter` continues jointly. Every arm has the same data, number
+of steps and initial networks. Another image model evaluates them: waves, more fields, more
+wavelengths, images that no arm has used. Writes lenses/ARM SEED.yaml.
 """
 
 import dataclasses
@@ -41,8 +47,8 @@ _MEASURES = {"mae": 4, "rmse": 4, "psnr": 2, "ssim": 4, "sensor_psnr": 2}
 
 @dataclasses.dataclass(frozen=True)
 class StartErrors:
-    """Errors of the lens that all arms begin with: standard deviations of all curvatures, per cent,
-    and thicknesses, mm."""
+    """Errors of the spoilt lens, the start of all arms: standard deviations of all curvatures, per
+    cent, and thicknesses, mm."""
 
     per_cent: Annotated[float, within(0, 50)] = 2.0
     off_mm: Annotated[float, within(0, 100)] = 0.05
@@ -53,7 +59,7 @@ class StartErrors:
 class Camera:
     """Sensor. pixel_um: side of a pixel. kernel: side of the kernels, pixels, odd. tolerance: sum
     of the errors of a kernel's pixels in training. kind: of the kernels in training, by "rays" or
-    by "waves" (with as many cells as the judge)."""
+    by "waves" (with as many cells as in the evaluation)."""
 
     pixel_um: Annotated[float, within(0.05, 1e4)] = 6.0
     kernel: Annotated[int, within(3, 255), odd] = 21
@@ -67,7 +73,7 @@ class Training:
 
     points: object points of a step, which share the batch.
     optics_rate: Adam's rate of each variable, as the change of the spots by a step, um.
-    rays_um: by how far the first steps of `rays` move the rays, root mean square, um; they become
+    rays_um: RMS displacement of the rays by the first steps of `rays`, um; later steps become
         shorter as a cosine.
     taps_rate: Adam's rate of the taps of the filter.
     """
@@ -89,13 +95,13 @@ class Training:
 
 @dataclasses.dataclass(frozen=True)
 class Judge:
-    """The independent model of the picture.
+    """The independent image model of the evaluation.
 
-    rings: fields, each at another azimuth. depths: distances, even in 1 / distance.
+    rings: fields, each at another azimuth. depths: distances, equidistant in 1 / distance.
     waves: wavelengths of each channel. cells: of the wave kernels, along a side.
     patches: for each point. builds: lenses as built, for arms of `tolerances`.
-    others: a folder of photographs that judge, too: all, and the thirds with the least and the most
-        colour; empty for none.
+    others: a folder of further photographs for the evaluation: all, and the thirds with the least
+        and the most colour; empty for none.
     """
 
     rings: Annotated[int, within(1, 64)] = 8
@@ -110,7 +116,7 @@ class Judge:
 
 @dataclasses.dataclass(frozen=True)
 class Map:
-    """Scenes for which finished lenses are compared behind their best filters, without training.
+    """Scenes for which optimised lenses are compared after their best filters, without training.
     noise: as of the experiment. near_m: nearest objects. plates: at each of `stops`, factors of the
         coefficients in the lens's file, such as those of a cubic plate; they must be `held`."""
 
@@ -123,7 +129,7 @@ class Map:
 class Config:
     """Settings of the experiment; see configs/joint.yaml.
 
-    lens: before it is spoilt, a bundled name or YAML path.
+    lens: the lens before it is disturbed, a bundled name or YAML path.
     variables, ties, solves, limits: as in experiments.design; `limits` hold in least squares and
         in training.
     field_deg: largest field angle; fields cover the disc.
@@ -203,7 +209,7 @@ class Config:
 
 
 def tables(results: dict[str, Any]) -> dict[str, str]:
-    """Errors of all arms, and their differences from the finished lens."""
+    """Errors of all arms, and their differences from the arm `spots`."""
     name, found = results["name"], {}
     if results.get("map"):  # older runs have no key
         found[f"joint, {name}: map"] = _map_table(results["map"])

@@ -91,7 +91,7 @@ def _outcome(ended: _Ended, folder: pathlib.Path, truth: dict[str, Any]) -> tupl
 
 
 def _broken_off(folder: pathlib.Path, way: _Way) -> str:
-    """Goes on with the run in a folder and ends it; what went wrong then, "" for nothing."""
+    """Resumes the run in a folder and ends it; returns what went wrong, "" for nothing."""
     process = _start(folder, (folder / "config.yaml").is_file(), way)
     if way.signals:
         time.sleep(way.seconds)

@@ -220,7 +220,7 @@ REFUSED = {
     "sensor is shared, but begins at 42": (
         [{"vary": ["sensor"]}, {"vary": ["sensor"], "lens": configured(
             load_lens("cooke_triplet"), {"sensor": (45.0,)})[0]}], []),
-    "bounds exclude each other": (
+    "bounds have no common range": (
         [{"vary": [Vary("sensor", low=40, high=42.21)]}, {"vary": [Vary("sensor", low=42.21)]}],
         []),
     "solves: focal_length: changes curvature 4": (

@@ -418,7 +418,7 @@ def test_a_dark_field_is_no_good_one(tmp_path):
     )
     merit, gradient = jax.jit(jax.value_and_grad(problem.merit))(problem.variables.start)
     assert np.isinf(merit) and np.all(np.isfinite(gradient))
-    with pytest.raises(ValueError, match="the start cannot be judged"):
+    with pytest.raises(ValueError, match="the start cannot be evaluated"):
         design.optimise(problem, max_steps=2)
 
 
@@ -443,7 +443,7 @@ def test_obscurations_need_another_rule():
             dict(kind="rms_spot", weight=-1),
             "rms_spot: weight: must be above 0, or 0 to leave it out",
         ),
-        (dict(kind="length", vignetting=False), "length: vignetting: is of spot, spot_of_colours,"),
+        (dict(kind="length", vignetting=False), "vignetting: only for spot, spot_of_colours,"),
         (dict(kind="centroid", target=np.inf), "operands: centroid: target: must be finite"),
         (dict(kind="length", target=3, high=4), "has a target and limits; make two operands"),
         (dict(kind="spot", high=0.1), "spot: takes no target and no limits; use rms_spot"),
@@ -454,8 +454,8 @@ def test_obscurations_need_another_rule():
         ),
         (dict(kind="mtf", target=1), "mtf: at: missing; give the frequency of an mtf in cycles/mm"),
         (dict(kind="mtf", target=1, at=-5), "mtf: at: must be above 0 and finite, got -5"),
-        (dict(kind="mtf", at=50), "mtf: target: 0 is no light; give 1 for the best, or limits"),
-        (dict(kind="spot", at=50), "spot: at: is of mtf and encircled_energy; leave it out"),
+        (dict(kind="mtf", at=50), "mtf: target: 0 means no light; give 1 for the best, or limits"),
+        (dict(kind="spot", at=50), "spot: at: only mtf and encircled_energy have it; leave it out"),
         (dict(kind="spot", fields=0), "operands: spot: fields: expected whole numbers"),
         (dict(kind="spot", fields=("x",)), "operands: spot: fields: expected whole numbers"),
     ],

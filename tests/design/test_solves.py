@@ -252,9 +252,9 @@ def test_a_lens_without_focus(tmp_path):
     )
     plate = load_lens(path)
     for solve, said in (
-        (Solve("paraxial_focus"), "solves: paraxial_focus: there is none"),
-        (Solve("best_focus"), "solves: best_focus: there is none"),
-        (Solve("focal_length", surface=1), "focal_length: the lens has none to keep; give its"),
+        (Solve("paraxial_focus"), "solves: paraxial_focus: there is no focus"),
+        (Solve("best_focus"), "solves: best_focus: there is no focus"),
+        (Solve("focal_length", surface=1), "focal_length: the lens has no such value to keep"),
     ):
         with pytest.raises(ValueError, match=said):
             Variables.from_lens(plate, ["thickness", Vary("curvature", (0,))], solves=[solve])

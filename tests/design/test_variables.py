@@ -165,7 +165,7 @@ def test_coefficients_bounded_by_what_they_add_to_the_sag(form):
         ({"kind": "conic", "sag": 0.1, "semi_diameter": 3}, "are of coefficients, not of conic"),
         ({"sag": 0.1}, "give both, above 0 mm, got 0.1 and 0"),
         ({"sag": -0.1, "semi_diameter": 1}, "give both, above 0 mm"),
-        ({"sag": 0.1, "semi_diameter": 1, "low": 0.0}, "stand instead of low and high"),
+        ({"sag": 0.1, "semi_diameter": 1, "low": 0.0}, "replace low and high"),
     ],
 )
 def test_bounds_by_sag_that_mean_nothing(given, said):

@@ -80,7 +80,7 @@ WRONG = {
     "joint": [
         (
             "camera={pixel_um: 4, kernel: 9, tolerance: 0.2}",
-            "camera.kernel: ...of the light of the spoilt lens falls beside a kernel of 9 pixels",
+            "camera.kernel: ...of the light of the spoilt lens falls outside a kernel of 9 pixels",
         ),
         (
             "judge={rings: 2, patches: 1, waves: 2, cells: 16}",

@@ -90,7 +90,7 @@ def test_contrast_of_a_telescope_is_that_of_its_exit_pupil():
 def test_an_afocal_lens_has_no_focus(tmp_path):
     drt_jax.save_lens(LENS, tmp_path / "t.yaml")
     assert load_lens(tmp_path / "t.yaml").afocal
-    with pytest.raises(ValueError, match="no place of the sensor"):
+    with pytest.raises(ValueError, match="no sensor position"):
         drt_jax.focus_moments(LENS, Scene.point(0.0, np.inf, WAVE), sampling=RULE)
 
 

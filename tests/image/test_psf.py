@@ -268,7 +268,7 @@ def test_defocus_is_the_sensor_moved(double_gauss):
 
 @pytest.mark.slow
 def test_auto_says_how_good_the_gaussian_is(double_gauss):
-    beside = "of the light falls beside a kernel of 21 x 21 pixels"
+    beside = "of the light falls outside a kernel of 21 x 21 pixels"
     with pytest.warns(UserWarning, match=beside) as said:
         model = drt_jax.converge(drt_jax.psf, *double_gauss, PIXEL, SIZE, "auto", 0.2)
     assert {one.filename for one in said} == {__file__}

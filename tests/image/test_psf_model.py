@@ -30,7 +30,7 @@ def beam_of(radius, aperture=0.1):
 def size_told(radius, kind):
     waves, pixels = jnp.array([WAVE]), Pixels(jnp.array(PIXEL), 5)
     outside = np.array([[0.0], [0.2]])
-    with pytest.warns(UserWarning, match="20 % of the light falls beside a kernel") as said:
+    with pytest.warns(UserWarning, match="20 % of the light falls outside a kernel") as said:
         module._warn(outside, [None, beam_of(radius)].__getitem__, waves, pixels, kind)
     assert said[0].filename == __file__
     return int(re.search(r"; (\d+) x \1 hold 99 %", str(said[0].message))[1])
