@@ -253,6 +253,18 @@ def xyz(rays):
     return np.stack([np.stack(np.broadcast_arrays(*hit), -1) for hit in rays.hits], -2)
 
 
+def rays_of(lens, scene, pupil):
+    """Hits (P, W, Q, S + 1, 3), mm, along the axes of the lens, and optical paths (P, W, Q), mm, of
+    rays through `pupil` (Q, 2), from the P points of a `drt_jax.Scene`. ArithmeticError or
+    AssertionError where a ray fails; apertures are ignored."""
+    fields, far = (np.asarray(a) for a in scene.flat())
+    each = [Scene.of(lens, *point, np.asarray(scene.wavelengths)) for point in zip(fields, far)]
+    points = Scene.stack(each)
+    found = trace(points, *aim(points, np.asarray(pupil).T))
+    assert np.all(found.good)
+    return np.real(xyz(found)), np.real(found.path)
+
+
 def outputs(scene, rule, symmetry, points, starts=(None, None)):
     """centroid (..., W, 2), covariance (..., W, 2, 2), path (..., W, Q) and hits
     (..., W, Q, S + 1, 3) along the axes of the lens.
