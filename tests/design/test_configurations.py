@@ -70,6 +70,7 @@ def evaluated():
     return y, all_of
 
 
+@pytest.mark.slow
 def test_two_configurations_are_two_problems():
     y, all_of = evaluated()
     _, _, found = all_of(y)
@@ -92,6 +93,7 @@ def test_two_configurations_are_two_problems():
     assert group.numbers == (0, 1) and len(group.differ) < 6
 
 
+@pytest.mark.slow
 def test_derivatives_are_those_of_differences():
     y, all_of = evaluated()
     _, slopes, _ = all_of(y)
