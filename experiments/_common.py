@@ -7,6 +7,7 @@ import json
 import math
 import pathlib
 import time
+import warnings
 from collections.abc import Callable, Iterable, Sequence
 from typing import Annotated, Any
 
@@ -14,7 +15,7 @@ import jax
 import numpy as np
 from tqdm import tqdm
 
-from drt_jax import Lens, Scene, load_lens, psf_moments
+from drt_jax import Lens, Scene, load_lens, load_system, psf_moments
 
 from .runs.config import ConfigError
 from .runs.folder import Run
@@ -116,6 +117,14 @@ class LensFile:
     def load(self) -> Lens:
         """The lens. LensError as of `load_lens`."""
         return load_lens(self.lens, configuration=self.configuration)
+
+    def distance(self) -> float:
+        """Distance of the object, mm: that of a .zmx or .seq file, else inf."""
+        if pathlib.Path(self.lens).suffix.lower() not in (".zmx", ".seq"):
+            return math.inf
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # `load` has warned
+            return float(load_system(self.lens, configuration=self.configuration).distance)
 
 
 def require_known(name: str, values: tuple[str, ...], known: Iterable[str]) -> None:

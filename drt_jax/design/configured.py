@@ -8,6 +8,7 @@ import numpy as np
 
 from ..inputs import require, require_one_of
 from ..lens.lens import Lens
+from ..numerics import concrete
 from .parts import PARTS, places_of, with_arrays, with_numbers
 
 
@@ -19,7 +20,8 @@ def configured(lens: Lens, numbers: Mapping[str, Sequence[float]]) -> tuple[Lens
         A name is a kind of `Vary`, the number of the surface and, of parts with several terms, the
         term: "tilt 3[0]". Units as in `Vary`.
 
-    ValueError, which names it, for a number that the lens does not have, and for other counts.
+    ValueError, which names it, for a number that the lens does not have, for other counts, and for
+    values that `Vary` excludes, such as a semi-diameter below 0, or NaN.
     """
     places, counts = {}, {name: np.shape(row) for name, row in numbers.items()}
     for name in numbers:
@@ -34,6 +36,10 @@ def configured(lens: Lens, numbers: Mapping[str, Sequence[float]]) -> tuple[Lens
     alike = len(set(counts.values())) == 1 and all(len(n) == 1 and n[0] for n in counts.values())
     found_counts = ", ".join(f"{name} has the shape {shape}" for name, shape in counts.items())
     require(alike, f"configured: give as many numbers for each name; {found_counts or 'none'}")
+    for name, row in numbers.items():
+        least, most = PARTS[places[name].kind].limits
+        fits = not concrete(row) or all(least <= n <= most for n in row)
+        require(fits, f"configured: {name}: expected numbers from {least:g} to {most:g}, got {row}")
     lens = with_arrays(lens, {place.kind for place in places.values()})
     rows = [[*zip(places.values(), row)] for row in zip(*numbers.values())]
     dtype = lens.curvature.dtype

@@ -54,7 +54,7 @@ def seq_text(systems: Sequence[System]) -> str:
     """The text of a file of one zoom position or more. LensError, with the remedy, for features
     that are not written; a warning tells how far a model glass differs that becomes a private one.
     """
-    texts = [_lines(system) for system in systems]
+    texts = [_lines(system, len(systems) > 1) for system in systems]
     whole = ["\n".join(lines).replace(" &\n", " ").split("\n") for lines in texts]
     return "\n".join([*texts[0], *_zooms(whole), "GO", ""])
 
@@ -80,8 +80,9 @@ def _zooms(texts: Sequence[Sequence[str]]) -> list[str]:
     return found
 
 
-def _lines(system: System) -> list[str]:
-    """The lines of one zoom position before GO."""
+def _lines(system: System, several: bool) -> list[str]:
+    """The lines of one zoom position before GO; of `several` also conics and vignetting of 0, which
+    others may have."""
     lens, worst = system.lens, 0.0
     require(not lens.afocal, ".seq files hold no afocal image space here: save as .yaml or .zmx")
     media, own = media_of_lens(lens)
@@ -102,7 +103,7 @@ def _lines(system: System) -> list[str]:
     require(math.isfinite(pupil) and pupil > 0, what)
     lines = ["RDM N", "LEN", f"TITLE '{' '.join(title.split())}'", f"EPD {pupil!r}", "DIM M"]
     tables = [line for name in own for line in _private(name, private[name], own[name])]
-    lines += [*_use(system), *(["PRV", *tables, "END"] if own else [])]
+    lines += [*_use(system, several), *(["PRV", *tables, "END"] if own else [])]
     words = [_word(keys, private) for keys in media]
     far = repr(float(system.distance)) if math.isfinite(system.distance) else "0.1e14"
     lines.append(f"SO 0.0 {far} {words[0]}".rstrip())
@@ -111,14 +112,15 @@ def _lines(system: System) -> list[str]:
         word = "REFL" if lens.mirrors[i] else words[i + 1]
         numbers = f"{float(lens.curvature[i])!r} {gap_behind(lens, i)!r}"
         lines.append(f"S {numbers} {word}".rstrip())
-        lines += [f"  {line}" for line in _surface(i, entry_of(lens, i, {})) + places[i]]
+        entry = entry_of(lens, i, {}) | ({"conic": float(lens.conic[i])} if several else {})
+        lines += [f"  {line}" for line in _surface(i, entry) + places[i]]
     lines.append(f"SI {float(lens.curvature[-1])!r} 0.0")
     conic = float(lens.conic[-1])
     lines += [f"  {line}" for line in [*(["CON", f"K {conic!r}"] if conic else []), *places[-1]]]
     return lines
 
 
-def _use(system: System) -> list[str]:
+def _use(system: System, several: bool) -> list[str]:
     """The lines of wavelengths, fields and vignetting."""
     kind = next(key for key, kind in FIELDS.items() if kind == system.field_kind)
     dx, dy, cx, cy, turn = system.vignetting.T
@@ -133,7 +135,7 @@ def _use(system: System) -> list[str]:
         "WTF": system.field_weights.tolist(),
     }
     edges = {"VUX": cx - dx, "VLX": cx + dx, "VUY": cy - dy, "VLY": cy + dy}
-    columns |= {key: edge.tolist() for key, edge in edges.items() if np.any(edge)}
+    columns |= {key: edge.tolist() for key, edge in edges.items() if several or np.any(edge)}
     return [line for key, row in columns.items() for line in _wrapped(key, map(repr, row))]
 
 
@@ -225,7 +227,7 @@ def _form(i: int, entry: Mapping[str, Any]) -> list[str]:
             require(power in letters, what)
         terms = [f"{letters[power]} {value!r}" for power, value in used.items()]
         if name == "asphere":
-            head = ["ASP"] if terms else (["CON"] if conic else [])
+            head = ["ASP"] if terms else (["CON"] if "conic" in entry else [])
             return head + ([f"K {conic!r}"] if head else []) + terms
         across = f"CUX {entry['curvature_x']!r}"
         if name == "toroid":

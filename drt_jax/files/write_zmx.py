@@ -54,12 +54,12 @@ _OTHERS = {"silica": "F_SILICA"}
 def zmx_text(systems: Sequence[System]) -> str:
     """The text of a file of one configuration or more. LensError, with the remedy, for features
     that are not written."""
-    texts = [_lines(system) for system in systems]
+    texts = [_lines(system, len(systems) > 1) for system in systems]
     return "\n".join([*texts[0], *rows(texts), ""])
 
 
-def _lines(system: System) -> list[str]:
-    """The lines of one configuration before MNUM."""
+def _lines(system: System, several: bool) -> list[str]:
+    """The lines of one configuration, of one or `several`, before MNUM."""
     lens = system.lens
     media = [medium_of(lens, i) or {} for i in range(lens.count + 1)]
     makers, names = written_names([own["glass"] for own in media if "glass" in own])
@@ -69,7 +69,7 @@ def _lines(system: System) -> list[str]:
     lines = [_HEAD.format(**head, aiming=_AIMING.get(system.ray_aiming, 2)), *_use(system)]
     curvature, conic = (float(a[-1]) for a in (lens.curvature, lens.conic))
     image = ["TYPE STANDARD", f"CURV {curvature!r}", f"CONI {conic!r}"]
-    surfaces = [*(_surface(lens, i, names) for i in range(lens.count)), image]
+    surfaces = [*(_surface(lens, i, names, several) for i in range(lens.count)), image]
     gaps = [gap_behind(lens, i) for i in range(lens.count)]
     blocks, (first, *behind) = _with_breaks(lens, surfaces, gaps)
     far = system.distance + first
@@ -102,9 +102,10 @@ def _numbers(name: str) -> str:
     return f"{nd:.7f} {vd:.5f}"
 
 
-def _surface(lens: Lens, i: int, names: Mapping[str, str]) -> list[str]:
-    """The lines of a surface but for its place."""
-    entry = entry_of(lens, i, {})
+def _surface(lens: Lens, i: int, names: Mapping[str, str], several: bool) -> list[str]:
+    """The lines of a surface but for its place. several: also a conic of 0, as others may have
+    another one."""
+    entry = entry_of(lens, i, {}) | ({"conic": float(lens.conic[i])} if several else {})
     lines = ["STOP"] if "stop" in entry else []
     lines += [*_form(i, entry), f"CURV {entry['curvature']!r}"]
     lines += [f"CONI {entry['conic']!r}"] if "conic" in entry else []

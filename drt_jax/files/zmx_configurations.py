@@ -4,6 +4,7 @@ The surfaces and the header have the numbers of the current configuration. The r
 are written over them before they are read.
 """
 
+import collections
 from collections.abc import Sequence
 
 from .entry import LensError
@@ -19,7 +20,8 @@ _FIELD = {
 }  # fmt: skip
 _WAVE = {"WAVE": 1, "WLWT": 2}
 _APERTURE = "ENPD", "FNUM", "OBNA"
-_NO_NUMBER = "MOFF", "MCOM", "NOTE"
+_NO_NUMBER = "MOFF", "MCOM", "NOTE", "LTTL"
+_AIR = "TEMP", "PRES"
 
 
 def choose(record: Record, found: list[Words], configuration: int | None) -> None:
@@ -45,12 +47,16 @@ def choose(record: Record, found: list[Words], configuration: int | None) -> Non
 
 
 def _operands(found: list[Words], count: int) -> list[list[Words]]:
-    """The rows of each operand, one for each configuration, in any order."""
-    operands: dict[tuple[str, ...], dict[str, Words]] = {}
+    """The rows of each operand, one for each configuration, in any order. Operands of one name and
+    place, such as PRAM of two parameters, are told apart by their order."""
+    operands: dict[tuple[str, str, int], dict[str, Words]] = {}
+    before = collections.Counter[tuple[str, str, str]]()
     for words in found:
         if len(words.values) > 2:
             where, number = words.values[:2]
-            operands.setdefault((words.key, where), {})[number] = words
+            row = words.key, where, number
+            operands.setdefault((words.key, where, before[row]), {})[number] = words
+            before[row] += 1
     names = [str(k + 1) for k in range(count)]
     return [[own[n] for n in names] for own in operands.values() if own.keys() >= {*names}]
 
@@ -58,6 +64,11 @@ def _operands(found: list[Words], count: int) -> list[list[Words]]:
 def _write(record: Record, found: list[Words], row: Words) -> None:
     """Write the number of a row over the one that is read."""
     key, where, value = row.key, row.count(), row.values[2]
+    what = f"{key}, which differs between configurations"
+    if key in _AIR:
+        return record.lacks(row.line, what)
+    known = key in (*_SURFACE, *_FIELD, *_WAVE, "APER")
+    row.require(known, f"{what}: not supported; save each configuration as a file of its own")
     row.number(2)  # LensError for what is no number
     first = next((k for k, words in enumerate(found) if words.key == "SURF"), 0)
     head = found[:first]
@@ -80,12 +91,10 @@ def _write(record: Record, found: list[Words], row: Words) -> None:
         waves = [words for words in head if words.key == "WAVM" and words.count() == where]
         row.require(waves and len(waves[0].values) > _WAVE[key], what)
         waves[0].values[_WAVE[key]] = value
-    elif key == "APER":
+    else:
         for words in head:
             if words.key in _APERTURE:
                 words.values[:1] = [value]
-    else:
-        record.lacks(row.line, f"{key}, which differs between configurations")
 
 
 def rows(texts: Sequence[Sequence[str]]) -> list[str]:

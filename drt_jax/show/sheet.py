@@ -228,6 +228,8 @@ def analysed(
     third: ThirdOrder | str
     try:
         third = jax.tree.map(lambda a: np.asarray(a)[0], of_third.result())
+        if not all(np.all(np.isfinite(part)) for part in third):  # as in `jit` of tilted surfaces
+            third = "third order: no theory for tilted or decentred surfaces"
     except ValueError as error:  # no theory for such a lens
         third = str(error)
     traced = shown, left_out, line, foci, bent, colour, fans, spots, hits

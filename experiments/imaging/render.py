@@ -41,15 +41,16 @@ class Scene(LensFile):
     """The lens and its scene.
 
     wavelengths_um: wavelengths of R, G, B.
-    distance_m: distance of the object, .inf for infinity.
+    distance_m: distance of the object, .inf for infinity; null for that of a .zmx or .seq file,
+        and infinity for other lenses.
     depth: picture of the size of the photograph, linear in 1 / distance, white for `near_m`, black
-        for `distance_m`; empty for all at distance_m.
+        for the distance of the object; empty for all at that distance.
     near_m: nearest distance of `depth`.
     """
 
     lens: str = "double_gauss"
     wavelengths_um: Annotated[tuple[float, ...], three_colours] = (0.6, 0.53, 0.48)
-    distance_m: Annotated[float, _positive] = math.inf
+    distance_m: Annotated[float, _positive] | None = None
     depth: str = ""
     near_m: Annotated[float, _positive] = 1.0
 
@@ -115,15 +116,16 @@ def _read(key: str, name: str) -> np.ndarray:
 def _distance(config: Config, shape: tuple[int, int]) -> Any:
     """Distance of the object, a number or (H, W), mm."""
     scene = config.scene
+    far = scene.distance() if scene.distance_m is None else 1e3 * scene.distance_m
     if not scene.depth:
-        return 1e3 * scene.distance_m
+        return far
     grey = _read("scene.depth", scene.depth).mean(axis=-1) / 255
     if grey.shape != shape:
         sizes = f"{grey.shape[1]} x {grey.shape[0]}, the photograph {shape[1]} x {shape[0]}"
         raise ConfigError(f"scene.depth: {scene.depth} has {sizes} pixels: give one of its size")
-    far, near = 1e-3 / scene.distance_m, 1e-3 / scene.near_m
+    vergence, near = 1 / far, 1e-3 / scene.near_m
     with np.errstate(divide="ignore"):
-        return 1 / (far + (near - far) * grey)
+        return 1 / (vergence + (near - vergence) * grey)
 
 
 def run(config: Config, run: Run) -> dict[str, Any]:

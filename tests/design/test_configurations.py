@@ -255,6 +255,8 @@ def test_updates_are_led_back_within_the_bounds_of_all():
         ({"thickness 9": (1.0,)}, "no surface 9; there are 0, 1"),
         ({"sensor": (40.0, 41.0), "thickness 1": (5.0,)}, "as many numbers for each name"),
         ({}, "as many numbers"),
+        ({"thickness 3": (np.nan, 1.0)}, "thickness 3: expected numbers from -inf to inf, got"),
+        ({"semi_diameter 3": (3.8, -1.0)}, "semi_diameter 3: expected numbers from 1e-06 to inf"),
     ],
 )
 def test_configured_refuses(numbers, message):

@@ -36,6 +36,10 @@ def test_a_zoom_takes_its_photograph_in_any_configuration():
         config = load_config(experiment.Config, SETTINGS, [words, f"{key}={number}"])
         found = focal_length(config.scene.load(), 0.5876)
         np.testing.assert_allclose(found, focal, rtol=1e-3)
+    macro = f"scene.lens={ROOT / zoom.replace('5568323', '5257137')}"
+    for number, distance in ((1, np.inf), (2, 215.4011)):
+        config = load_config(experiment.Config, SETTINGS, [macro, f"{key}={number}"])
+        assert config.scene.distance() == distance
     config = load_config(experiment.Config, SETTINGS, [words, f"{key}=4"])
     with pytest.raises(LensError, match="no configuration 4; the file has 3"):
         config.scene.load()

@@ -13,17 +13,21 @@ WAVES, DISTANCES = (0.48, 0.55, 0.65), (np.inf, 1000.0, 500.0)
 
 @pytest.fixture(scope="module")
 def systems():
-    """A triplet that focuses by two gaps, bends a surface, and stops down; weights of all."""
+    """A triplet that focuses by two gaps, bends a surface, and stops down; weights of all. A conic
+    and vignetting stand in the second alone."""
     lens = load_lens("cooke_triplet")
     numbers = {
         "sensor": (42.2, 45.1, 47.3),
         "thickness 3": (4.75, 4.9, 4.9),
         "curvature 1": (-0.002, -0.0021, -0.002),
+        "conic 5": (0.0, -0.5, 0.0),
         f"semi_diameter {lens.stop}": (3.0, 2.5, 2.25),
     }
     weights = {"wavelength_weights": (1, 3, 2), "field_weights": (2, 1)}
     scenes = [Scene.degrees([0, 14], far, WAVES, **weights) for far in DISTANCES]
-    return [System.of(*pair) for pair in zip(design.configured(lens, numbers), scenes)]
+    found = [System.of(*pair) for pair in zip(design.configured(lens, numbers), scenes)]
+    found[1] = dataclasses.replace(found[1], vignetting=np.array([[0] * 5, [0, 0.1, 0, 0.2, 0]]))
+    return found
 
 
 @pytest.mark.parametrize("kind", ["zmx", "seq"])
@@ -33,7 +37,8 @@ def test_all_configurations_come_back(systems, kind, tmp_path):
     for k, system in enumerate(systems, 1):
         again = load_system(file, configuration=k)
         assert (again.configurations, again.configuration, again.primary) == (3, k, 1)
-        for name in ("curvature", "thickness", "sensor"):
+        np.testing.assert_allclose(again.vignetting, system.vignetting, atol=1e-15)
+        for name in ("curvature", "conic", "thickness", "sensor"):
             pair = getattr(again.lens, name), getattr(system.lens, name)
             np.testing.assert_allclose(*pair, rtol=1e-12)
         stop = again.lens.semi_diameter[again.lens.stop]

@@ -782,6 +782,10 @@ def test_rows_that_are_not_known_are_refused_where_they_differ(tmp_path):
     with pytest.raises(LensError, match=message):
         read(tmp_path, tail=tail, configuration=2)
     assert read(tmp_path, tail=tail, configuration=1).configuration == 1
+    tail = ("MNUM 2 1", *rows("LTTL 0 wide tele", "PRAM 2 0 10", "PRAM 2 0 0"))
+    for missing in ("error", "warn"):  # of two parameters; what shapes a lens is never left out
+        with pytest.raises(LensError, match="line 41: PRAM, which differs .* file of its own"):
+            read(tmp_path, tail=tail, configuration=2, missing=missing)
     for row in ("THIC 9 1 2", "YFIE 9 1 2", "WAVE 9 1 2"):
         with pytest.raises(LensError, match=f"{row[:6]}: the file has none"):
             read(tmp_path, tail=("MNUM 2 1", *rows(row)), configuration=2)

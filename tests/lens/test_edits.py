@@ -212,9 +212,7 @@ def test_a_plate_leaves_paraxial_rays_behind_it_alone(surface, distance):
         sine, cosine = np.hypot(*np.moveaxis(along[..., :2], -1, 0)), along[..., 2]
         index = np.asarray(more.index(SCENE.wavelengths))[7][:, None]
         far = 1.5 * (1 - cosine / np.sqrt(index**2 - sine**2))  # along the axis
-        wanted = plain[..., -1, :2] + (added - far)[..., None] * (
-            along[..., :2] / along[..., 2:]
-        )
+        wanted = plain[..., -1, :2] + (added - far)[..., None] * (along[..., :2] / along[..., 2:])
         np.testing.assert_allclose(rays[..., -1, :2], wanted, rtol=0, atol=1e-11)
 
 

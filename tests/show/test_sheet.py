@@ -194,6 +194,16 @@ def test_the_numbers_of_a_sheet_are_those_of_the_analyses():
 
 
 @pytest.mark.slow
+def test_a_sheet_of_a_tilted_lens_says_that_third_order_has_no_theory():
+    """Where bars of numbers that are not finite would look like none."""
+    rows = LENS.count + 1
+    moved = {"tilt": jnp.zeros((rows, 3)).at[0, 0].set(0.01), "decentre": jnp.zeros((rows, 2))}
+    lens, scene = dataclasses.replace(LENS, **moved), Scene.radians(0.1, np.inf, 0.53)
+    found = analysed(lens, scene, None, lambda what: None)
+    assert found.third == "third order: no theory for tilted or decentred surfaces"
+
+
+@pytest.mark.slow
 def test_further_panels(tmp_path):
     scene = Scene.radians([0.0, 0.2], np.inf, WAVES[:2])
     titles = [*show.more_panels(LENS, scene)]
