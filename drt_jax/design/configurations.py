@@ -39,11 +39,12 @@ class SharedVariables:
     low, high: (N,), bounds of the vector.
     scale: (N,), in the units of the lens.
     start: (N,), the vector of the lenses at the start.
-    first: the variables of configuration 0.
+    first: the variables of the first configuration.
     index: (n,), positions of these in the vector.
 
     Static:
-    names: N names, such as "curvature 3" and "thickness 4 of configuration 0".
+    names: N names, such as "curvature 3" and "thickness 4 of configuration 1",
+        counted from 1 as in files.
     """
 
     low: Array
@@ -67,7 +68,7 @@ class SharedVariables:
         return [*lines, *rows[:_TOLD], *more]
 
     def lens_of(self, vector: Array) -> Lens:
-        """The lens of configuration 0 at a vector (N,), see `Configurations.lenses`."""
+        """The lens of the first configuration at a vector (N,), see `Configurations.lenses`."""
         return self.first.lens_of(vector[self.index])
 
 
@@ -259,7 +260,7 @@ class Configurations:
         rows, found = np.asarray(constraints), list[Limit]()
         for number, problem, _ in self._each():
             for limit in problem.limits(rows[len(found) :]):
-                where = ", ".join(filter(None, (f"configuration {number}", limit.where)))
+                where = ", ".join(filter(None, (f"configuration {number + 1}", limit.where)))
                 found.append(limit._replace(where=where))
         return found
 
@@ -344,13 +345,13 @@ def _slots(
         others: set[Place] = set(shared).symmetric_difference(p for p in places if not is_own(p))
         require(
             not others,
-            f"variables: configuration {number} and 0 do not both vary "
+            f"variables: configuration {number + 1} and 1 do not both vary "
             f"{', '.join(sorted(map(str, others)))}; vary it in all, or name it in own",
         )
     slots = {str(place): k for k, place in enumerate(shared)}
     index = []
     for number, places in enumerate(sets):
-        names = [f"{p} of configuration {number}" if is_own(p) else str(p) for p in places]
+        names = [f"{p} of configuration {number + 1}" if is_own(p) else str(p) for p in places]
         index.append(np.array([slots.setdefault(name, len(slots)) for name in names], np.int32))
     return index, slots
 
@@ -382,8 +383,8 @@ def _shared(problems: Sequence[Problem], index: Sequence[np.ndarray], count: int
         for name, is_off, at, first in zip(own.names, off, begins, value[where]):
             require(
                 not is_off,
-                f"variables: {name} is shared, but begins at {first:g} in configuration 0 and at "
-                f"{at:g} in {number}; give it one number, or name it in own",
+                f"variables: {name} is shared, but begins at {first:g} in configuration 1 and at "
+                f"{at:g} in {number + 1}; give it one number, or name it in own",
             )
         for name, is_empty in zip(own.names, low[where] >= high[where]):
             require(not is_empty, f"variables: {name}: its bounds have no common range; widen one")

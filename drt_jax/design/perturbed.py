@@ -57,7 +57,8 @@ class Deviation(NamedTuple):
     kind: as in `Tolerance`.
     place: number of the surface or element.
     axis: component, 0 for x, 1 for y; 0 for a kind without components.
-    configuration: number of the only configuration that deviates; None if all do.
+    configuration: index of the only configuration that deviates, whose name counts from 1; None
+        if all do.
     """
 
     kind: str
@@ -69,8 +70,8 @@ class Deviation(NamedTuple):
         kind = KINDS[self.kind]
         axis = f", {'xy'[self.axis]}" if kind.axes > 1 else ""
         place = "" if kind.whole == "sensor" else f" of {kind.whole} {self.place}"
-        only = self.configuration
-        return f"{self.kind}{place}{axis}{'' if only is None else f' of configuration {only}'}"
+        own = "" if self.configuration is None else f" of configuration {self.configuration + 1}"
+        return f"{self.kind}{place}{axis}{own}"
 
 
 @jax.tree_util.register_dataclass
@@ -126,11 +127,11 @@ class PerturbedLens:
         spans, dtype = elements_of(lens), lens.curvature.dtype
         (lens, groups), *more = (_with_parts(one, spans, sizes) for one in (lens, *others))
         structure: Any = jax.tree.structure(lens)
-        for number, (other, own) in enumerate(more, start=1):
+        for number, (other, own) in enumerate(more, start=2):
             alike = elements_of(other) == spans and own == groups
             require(
                 alike and structure == jax.tree.structure(other),
-                f"lens: configuration {number} differs from 0 in more than numbers (surfaces, "
+                f"lens: configuration {number} differs from 1 in more than numbers (surfaces, "
                 "elements, tilts that only one has); make them by `configured`",
             )
         numbers = jnp.asarray(beam_radius, dtype), jnp.asarray([*sizes.values()], dtype)

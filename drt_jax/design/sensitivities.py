@@ -86,7 +86,7 @@ class Sensitivity(NamedTuple):
         changes = (f"{when} {sign}{unit}" for when in ("before", "after") for sign in "-+")
         moved = (f"{name} ({unit})" for name, unit in self.adjustments)
         each = np.zeros((len(some.sizes), 2, 0)) if some.each is None else some.each
-        worse = (f"in configuration {number}{unit}" for number in range(each.shape[2]))
+        worse = (f"in configuration {number}{unit}" for number in range(1, each.shape[2] + 1))
         rows = [["error", "size", *changes, *worse, *moved]]
         for k, deviation in enumerate(some.deviations):
             size = f"{some.sizes[k]:.4g} {KINDS[deviation.kind].unit}".strip()
@@ -182,7 +182,7 @@ def _names_of_focus(count: int, configurations: int) -> tuple[tuple[str, str], .
     if configurations == 1 or count <= 1:
         return _FOCUS[:count]
     own = _FOCUS[: count // configurations]
-    numbers = range(configurations)
+    numbers = range(1, configurations + 1)
     return tuple((f"{name} of configuration {k}", unit) for k in numbers for name, unit in own)
 
 

@@ -223,7 +223,7 @@ def view_of(options: argparse.Namespace) -> View:
         waves = [*others[:middle], primary, *others[middle:]]
         angles = system.fields
         if angles is not None and not np.any(angles[:, 0]):
-            fields = np.unique(np.round(np.degrees(angles[:, 1]), 12)).tolist()
+            fields = (np.unique(np.round(np.degrees(angles[:, 1]), 12)) + 0.0).tolist()  # no -0
         elif options.field is None:
             warnings.warn("the file has no fields along y alone; give --field", stacklevel=2)
     else:

@@ -77,8 +77,8 @@ def test_two_configurations_are_two_problems():
     shared, own = y[:5], y[5:]
     assert both().variables.names == (
         *(f"curvature {k}" for k in range(5)),
-        "thickness 3 of configuration 0",
         "thickness 3 of configuration 1",
+        "thickness 3 of configuration 2",
     )
     residuals, constraints = [], []
     evaluate = jax.jit(lambda problem, y: problem.evaluate(y))
@@ -137,8 +137,8 @@ def test_limits_name_their_configuration():
     assert len(limits) == found.constraints.size
     half = len(limits) // 2
     assert [limit.where.split(",")[0] for limit in limits[half - 1 : half + 1]] == [
-        "configuration 0",
         "configuration 1",
+        "configuration 2",
     ]
     np.testing.assert_allclose(limits[half].excess * 2.0, found.constraints[half])
 

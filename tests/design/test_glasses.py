@@ -255,7 +255,7 @@ def test_glasses_of_configurations_are_shared():
     assert best.lenses[0].glasses[1] == best.lenses[1].glasses[1] == best.snaps[0].glass
     np.testing.assert_allclose([lens.sensor for lens in best.lenses], [9.5, 10.5], atol=1e-6)
     apart = design.Configurations.from_problems(problems, ["sensor", "index"])
-    with pytest.raises(ValueError, match="index 0 of configuration 0, .*; one glass serves all"):
+    with pytest.raises(ValueError, match="index 0 of configuration 1, .*; one glass serves all"):
         design.snap_glasses(apart, found)
 
 

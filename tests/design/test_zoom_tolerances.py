@@ -101,8 +101,8 @@ def test_errors_are_common_or_of_one_configuration():
     _, _, some = zoom()
     assert [str(one) for one in some.deviations] == [
         "radius of surface 0",
-        "thickness of surface 1 of configuration 0",
         "thickness of surface 1 of configuration 1",
+        "thickness of surface 1 of configuration 2",
         "decentre of element 1, x",
         "decentre of element 1, y",
     ]
@@ -139,9 +139,9 @@ def test_each_row_is_the_zoom_disturbed_by_hand(compensator, by_hand):
             before = spot(np.array(held)) - spot(nominal)
             assert table.before[k, side] == pytest.approx(before, abs=1e-9)
     rows = table.rows()
-    assert rows[0][6:8] == ["in configuration 0 (um)", "in configuration 1 (um)"]
+    assert rows[0][6:8] == ["in configuration 1 (um)", "in configuration 2 (um)"]
     names = {
-        "focus": ["sensor of configuration 0 (mm)", "sensor of configuration 1 (mm)"],
+        "focus": ["sensor of configuration 1 (mm)", "sensor of configuration 2 (mm)"],
         "common focus": ["sensor (mm)"],
     }
     assert rows[0][8:] == names[compensator] and len(rows) == 6
@@ -217,5 +217,5 @@ def test_what_does_not_fit_is_refused():
     with pytest.raises(ValueError, match="problem: has 2 configurations, the lens 1"):
         design.predict(both, alone, "focus")
     other = load_lens("singlet")
-    with pytest.raises(ValueError, match="lens: configuration 1 differs from 0"):
+    with pytest.raises(ValueError, match="lens: configuration 2 differs from 1"):
         PerturbedLens.from_lens([some.lens, other], some.beam_radius, ERRORS)
