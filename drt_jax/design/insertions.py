@@ -1,6 +1,7 @@
 """One more element: a thin meniscus at each surface, and least squares from both sides of it."""
 
 import dataclasses
+import math
 from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
@@ -52,7 +53,8 @@ def insertions(
     problem_of: returns the problem of a lens with two more surfaces. Its variables should have all
         curvatures, and thicknesses with a lower bound.
     glass: glass of the new elements; None for the glass of the surface at which they are inserted.
-    thickness: of the meniscus at the start, and its distance from the surface, mm.
+    thickness: of the meniscus at the start, and its distance from the surface, mm; a third of a gap
+        that is too small.
     bend: change of c2 at the start, relative to the largest curvature of the lens.
     max_steps: as in `optimise`.
 
@@ -69,10 +71,12 @@ def insertions(
     require(places, "lens: has no surface between air and glass")
     size = bend * float(jnp.max(jnp.abs(lens.curvature)))
     for i, front, own in places:
-        gap = float(abs(lens.thickness[i - 1])) if front and i else 0.0
-        behind, far = (i - 1, gap - 2 * thickness) if gap else (i - front, thickness)
-        new = own if glass is None else glass
-        start = inserted(lens, behind, new, i, far, thickness)
+        behind = i - front
+        inside = 0 <= behind < len(lens.thickness)
+        gap = float(abs(lens.thickness[behind])) if inside else math.inf
+        thin = min(thickness, gap / 3)
+        far = gap - 2 * thin if front and inside else thin
+        start = inserted(lens, behind, own if glass is None else glass, i, far, thin)
         problem = problem_of(start)
         middle = behind + (2 if front else 1)
         for way in (1, -1):

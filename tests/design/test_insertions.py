@@ -1,6 +1,7 @@
 """A thin meniscus at a surface: the saddle point, and the ways down from it."""
 
 import dataclasses
+import sys
 
 import numpy as np
 import pytest
@@ -57,6 +58,24 @@ def test_both_ways_down_from_every_surface():
     ]
     squares = sum(float(np.trace(spot.covariance[0, 0])) for spot in spots)
     assert squares == pytest.approx(least.merit, rel=0.1)  # order 3 of the design
+
+
+def test_a_narrow_gap_gets_a_thinner_meniscus(monkeypatch):
+    """A gap of 0.06 mm had no room for one of 0.05 mm, which ended the scan."""
+    room = sys.modules["drt_jax.design.insertions"]  # whose name is that of its function, too
+    monkeypatch.setattr(room, "optimise", lambda *_: None)
+    rows = [ROW | {"thickness": 3}, {"radius": -150, "thickness": 0.06}, ROW | {"stop": False}]
+    lens = design.open_apertures(
+        drt_jax.load_lens({"surfaces": [*rows, {"radius": -90}], "sensor": 60})
+    )
+    found = list(design.insertions(lens, problem_of))
+    assert [(one.at, one.front) for one in found[::2]] == [
+        *((0, True), (1, False), (2, True), (3, False)),
+    ]
+    for one in found:
+        thick = one.problem.variables.lens_of(one.problem.variables.start).thickness
+        thin = 0.02 if one.at in (1, 2) else 0.05
+        assert np.all(thick > 0) and np.sum(np.abs(thick - thin) < 1e-12) >= 2 - (one.at in (0, 3))
 
 
 def test_a_lens_without_glass_is_refused():
