@@ -220,7 +220,7 @@ def differing(
 
     begins: the beginning of the first line of each surface.
     """
-    what = "configurations differ in more than numbers: other glasses, forms, fields or apertures"
+    what = "configurations differ in more than numbers: glasses, forms, tilts, fields or apertures"
     require(len({*map(len, texts)}) == 1, what)
     surface = -1
     for lines in zip(*texts, strict=True):
