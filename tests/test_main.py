@@ -190,7 +190,7 @@ def test_a_lens_file_is_shown_as_it_is_used(tmp_path):
     path.write_text(more.replace("FTYP 0 0 3 4", "FTYP 0 0 3 6"))
     view = view_of(_options(["show", str(path)]))
     assert view.wavelengths == [0.7, 0.5876, 0.4861]
-    assert view.note == "  ! wavelengths of the file left out: 0.6563, 0.6, 0.55 um"
+    assert view.note == "  ! left out of what the file has: wavelengths 0.6563, 0.6, 0.55 um"
     path.write_text(re.sub("YFLN.*", "YFLN 0 0 0", path.read_text()))  # the axis alone
     assert view_of(_options(["show", str(path)]))[1] == [0]
     view = view_of(_options(["show", "singlet"])).lit()

@@ -225,7 +225,8 @@ def seidel(axes: Axes, found: ThirdOrder, wavelength: int = 0) -> Axes:
         axes.bar(places, row / spacing, bottom=-k, color=["black"] * (len(row) - 1) + ["0.5"])
         axes.axhline(-k, color="0.7", linewidth=0.6, zorder=0)
     axes.set_yticks(-np.arange(len(bars)), [name.replace("_", " ") for name in kinds])
-    axes.set_xticks(places, [*map(str, places[:-1]), "sum"])
+    shown = places[: -1 : 1 + len(places) // 13]  # names of more would touch
+    axes.set_xticks([*shown, places[-1]], [*map(str, shown), "sum"])
     axes.set(ylim=(0.5 - len(bars), 0.5), xlabel=f"surface; line spacing {spacing:.3g} mm")
     return axes
 

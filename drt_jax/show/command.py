@@ -206,8 +206,8 @@ class View(NamedTuple):
 
 def view_of(options: argparse.Namespace) -> View:
     """What the options and a file ask for. Options override the values of a .zmx or .seq file."""
-    fields: list[float] = []
-    distance, waves, note = math.inf, list(_LINES), ""
+    fields, left = list[float](), list[str]()
+    distance, waves = math.inf, list(_LINES)
     weights = {wave: 1.0 for wave in waves}
     if pathlib.Path(options.lens).suffix.lower() in OTHERS:
         system = load_system(options.lens, options.missing, options.configuration)
@@ -216,14 +216,16 @@ def view_of(options: argparse.Namespace) -> View:
         weights = dict(zip(map(float, system.wavelengths), map(float, system.wavelength_weights)))
         others = sorted({*weights} - {primary}, reverse=True)
         if len(others) >= _WAVES and options.wavelengths is None:
-            left = ", ".join(f"{w:.4g}" for w in others[1:-1])
-            note = f"  ! wavelengths of the file left out: {left} um"
+            left.append(f"wavelengths {', '.join(f'{w:.4g}' for w in others[1:-1])} um")
             others = [others[0], others[-1]]
         middle = (len(others) + 1) // 2
         waves = [*others[:middle], primary, *others[middle:]]
         angles = system.fields
         if angles is not None and not np.any(angles[:, 0]):
-            fields = (np.unique(np.round(np.degrees(angles[:, 1]), 12)) + 0.0).tolist()  # no -0
+            every = (np.unique(np.round(np.degrees(angles[:, 1]), 12)) + 0.0).tolist()  # no -0
+            fields = [angle for angle in every if abs(angle) < 90] or every
+            if len(fields) < len(every) and options.field is None:
+                left.append("fields of 90 degrees or more")
         elif options.field is None:
             warnings.warn("the file has no fields along y alone; give --field", stacklevel=2)
     else:
@@ -231,6 +233,7 @@ def view_of(options: argparse.Namespace) -> View:
     distance = distance if options.distance is None else options.distance
     waves = options.wavelengths or waves
     shares = [weights.get(wave, 1.0) for wave in waves]
+    note = f"  ! left out of what the file has: {'; '.join(left)}" if left else ""
     return View(lens, options.field or fields, distance, waves, shares, note)
 
 
