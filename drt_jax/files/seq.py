@@ -52,9 +52,13 @@ class _Reader:
     """The state of reading one file.
 
     lists, list_lines: numbers of fields and wavelengths by key, and the line of each key's last
-    command. unit: of length, mm. radii: whether numbers of surfaces are radii, None until RDM says.
-    complete: whether the image has come. stop: number of its surface, 0 until it is known. clips:
-    whether apertures are used. wanted: the zoom position to read, see `load_system`.
+        command.
+    unit: unit of length, mm.
+    radii: whether surfaces have radii (True) or curvatures; None before a command RDM.
+    complete: whether the image surface has been read.
+    stop: number of the stop surface, 0 until it is known.
+    clips: whether apertures are used.
+    wanted: the zoom position to read, see `load_system`.
     """
 
     def __init__(self, path: str, missing: Missing, wanted: int | None):
@@ -102,7 +106,7 @@ class _Reader:
 
 
 def _surface(reader: _Reader, command: Command) -> None:
-    """S, SO, SI or S with a number: begin a new surface, or change an existing one."""
+    """S, SO, SI or S with a number: start a new surface, or change an existing one."""
     name, due, words = command.key[1:], len(reader.surfaces), command.values
     before = not reader.complete or name == "I" or name.isdecimal()
     command.require(name != "S" and before, f"{command.key}: a surface behind the image")
@@ -242,7 +246,7 @@ def _finish(reader: _Reader) -> None:
 
 
 def _use(reader: _Reader) -> None:
-    """Write fields and wavelengths as `System` holds them."""
+    """Write fields and wavelengths in the form of `System`."""
     record, lists, lines = reader.record, reader.lists, reader.list_lines
     use, waves = record.use, record.use.wavelengths
 
@@ -279,7 +283,7 @@ def _use(reader: _Reader) -> None:
 
 @dataclasses.dataclass
 class _Frames:
-    """The axis at each surface: its origin `point` (3,), mm, and its rotation `turn` (3, 3)."""
+    """The local axes at each surface: origin `point` (3,), mm, and rotation `turn` (3, 3)."""
 
     record: Record
     point: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(3))
@@ -287,12 +291,12 @@ class _Frames:
     before: list[tuple[np.ndarray, np.ndarray, bool]] = dataclasses.field(default_factory=list)
 
     def parts(self, surface: Surface, image: bool) -> list[Row | Breaking]:
-        """A surface with the breaks before and behind it; the last part takes its thickness.
+        """A surface with the breaks in front of it and behind it; the last part has its thickness.
 
-        A decentre and tilt is a break in front of the surface, which moves all that follows. With
-        DAR it moves the surface alone; with REV the inverse move stands behind the surface; with
-        BEN the tilt is repeated behind it, as at a folding mirror; RET returns to the axis of an
-        earlier surface.
+        A decentre and tilt becomes a break in front of the surface, which moves all that follows.
+        With DAR only the surface is moved. With REV the inverse break follows the surface. With BEN
+        the tilt is repeated behind the surface, as at a folding mirror. RET returns to the axis of
+        an earlier surface.
         """
         kind, line = surface.turn, surface.move_line
         x, y, z, a, b, c = (surface.moves.get(key, 0.0) for key in MOVES)

@@ -103,7 +103,7 @@ def _numbers(name: str) -> str:
 
 
 def _surface(lens: Lens, i: int, names: Mapping[str, str]) -> list[str]:
-    """The lines of a surface but for its place."""
+    """The lines of a surface except those of its position."""
     entry = entry_of(lens, i, {})
     lines = ["STOP"] if "stop" in entry else []
     lines += [*_form(i, entry), f"CURV {entry['curvature']!r}"]
@@ -135,7 +135,7 @@ def _form(i: int, entry: Mapping[str, Any]) -> list[str]:
     require(fits, f"surfaces[{i}]: .zmx files hold no {what} here: save as .yaml")
     if own and row[0]:
         row[0] = 1 / row[0]  # a radius
-    # The last coefficient, even 0, preserves the number of columns.
+    # The last coefficient is written even if it is 0: it preserves the number of columns.
     return [f"TYPE {kind}", *_numbered("PARM", *row[: len(numbers)])]
 
 
@@ -145,8 +145,8 @@ def _numbered(key: str, *values: float) -> list[str]:
 
 
 def _phase(i: int, name: str, phase: Mapping[str, Any], row: list[float]) -> list[str]:
-    """A grating on a conic or a toroid; or a radial phase (radians, norm radius 1 mm) on an even
-    asphere. name, row: form and coefficients of the surface."""
+    """The lines of a grating on a conic or a toroid, or of a radial phase (radians, norm radius
+    1 mm) on an even asphere. name, row: form and coefficients of the surface."""
     form, order, own = phase["form"], phase["order"], [*phase["coefficients"].values()]
     if form == "linear" and name == "asphere" and not any(row):
         return ["TYPE DGRATING", *_numbered("PARM", own[0] / 1e3, order)]
@@ -179,7 +179,7 @@ def _glass(lens: Lens, m: int, names: Mapping[str, str]) -> list[str]:
     ours = keys["nd"], keys["vd"], keys.get("dPgF", 0.0)
     theirs = to_theirs(*ours)
     rounded = ([round(value, digits) for value in theirs] for digits in range(3, 17))
-    # The fewest digits that read back.
+    # The fewest digits that are read back as the same numbers.
     short = next((values for values in rounded if to_ours(*values) == ours), theirs)
     return [f"GLAS ___BLANK 1 0 {' '.join(map(repr, short))}"]
 
@@ -228,8 +228,12 @@ def _with_breaks(
     lens: Lens, surfaces: list[list[str]], gaps: list[float]
 ) -> tuple[list[list[str]], list[float]]:
     """Insert the coordinate breaks among the blocks of lines of the S surfaces and the image.
-    Returns all blocks, and the thickness (mm) in front of each one; in front of the first it counts
-    from the first vertex before it is moved. gaps: (S,), mm, behind the surfaces."""
+
+    gaps: (S,), thickness behind each surface, mm.
+
+    Returns all blocks, and the thickness (mm) in front of each one. That in front of the first
+    block is measured from the first vertex before it is moved.
+    """
     moves, axis = _moves(lens), [0.0, *np.cumsum(gaps).tolist()]
     blocks: list[list[str]] = []
     behind: list[float] = []
@@ -242,7 +246,7 @@ def _with_breaks(
             about, along = move["about"], move["shift"][2]
             pivot = {before: 0.0, i: gap}.get(about, axis[about] - axis[before]) + move["pivot"]
             behind.append(pivot - at + (0.0 if back else along))
-            # With `back` the inverse: tilts in reverse order, then the decentre.
+            # `back` is the inverse: tilts in reverse order, then the decentre.
             numbers = [*move["shift"][:2], *move["tilt"]]
             values = [0.0 - value for value in numbers] if back else numbers
             lines = [f"PARM {k} {value!r}" for k, value in enumerate(values, 1) if value]
