@@ -1,5 +1,5 @@
-"""Situations in which trials by outside users found errors, as families of random scenes:
-immersion, virtual objects and images, collimated light, and lenses from files of other programs."""
+"""Situations of docs/trials.md as families of random scenes: immersion, virtual objects and images,
+collimated light, and lenses from files of other programs."""
 
 import contextlib
 import warnings
