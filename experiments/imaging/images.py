@@ -3,9 +3,9 @@
 Kernels by rays and by waves with increasing numbers of cells, and Gaussian kernels, are computed
 for each lens and field. `error` is the difference from the limit of the model: a histogram of very
 many rays, or waves with very many cells. `off` is the difference from the limit of waves. Both are
-sums of absolute differences over all pixels, for the worst wavelength. Optiland's FFT PSF and prysm's
-matrix Fourier transform are compared with the limit of waves at the middle wavelength; prysm traces
-no rays and gets our pupil function.
+sums of absolute differences over all pixels, for the worst wavelength. Optiland's FFT PSF and
+prysm's matrix Fourier transform are compared with the limit of waves at the middle wavelength;
+prysm traces no rays and gets our pupil function.
 
 Writes results.json: `kernels` have `lens`, `model`, `cells`, `value_s`, `gradient_s` (of a weighted
 sum of the kernel, by every number of the lens), `error`, `off`; `peers`; `views`: the light outside
