@@ -63,9 +63,7 @@ def test_lines_comments_quotes_and_letters(tmp_path):
     assert rows[0].entry == {"curvature": 0.02, "glass": "N-BK7", "stop": True}
     assert found.notes == [] and found.use.wavelengths == [0.55, 0.48]
     messages = refused(tmp_path, FRONT, "S -50 &\n 1.2.3")
-    assert (
-        ", line 10: expected a number, got '1.2.3'" in messages
-    )  # the line where the command starts
+    assert ", line 10: expected a number, got '1.2.3'" in messages  # its first line
 
 
 def test_radii_curvatures_and_units(tmp_path):
