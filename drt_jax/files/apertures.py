@@ -93,7 +93,11 @@ def semi_diameter(surface: Entry) -> float:
 
 
 def apertures_of(surfaces: list[Entry]) -> Apertures | None:
-    """All apertures and obscurations of the surfaces; None if there are none."""
+    """All apertures and obscurations of the surfaces; None if there are none.
+
+    Obscurations and polygons of several convex pieces make the open area a sum of terms, see
+    `Apertures.terms`. Each term is traced with its own rays, so that their number is limited.
+    """
     found = [
         (i, key == "obscuration", own)
         for i, surface in enumerate(surfaces)

@@ -192,7 +192,13 @@ class Record:
 
     def _prescription(self, semi_diameter: float) -> tuple[dict[str, Any], Lines, list[str]]:
         """Surfaces and elements for `build_lens`, the line of each key, and the name of each
-        surface. The distance of the object is measured from the first surface."""
+        surface. The distance of the object is measured from the first surface.
+
+        A coordinate break becomes an element from the next surface to the sensor. Its pivot lies on
+        the axis in front of this surface, at the position of the break. The thickness of the break
+        is added to that of the surface before it. Planes in air without an effect in front of the
+        first surface are left out.
+        """
         surfaces: list[dict[str, Any]] = []
         elements: list[dict[str, Any]] = []
         lines, names, waiting = Lines(), list[str](), list[Breaking]()

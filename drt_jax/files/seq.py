@@ -142,7 +142,12 @@ def _zoom(reader: _Reader, command: Command) -> None:
 
 
 def _take(reader: _Reader, command: Command) -> None:
-    """Execute a command from outside the private catalogue."""
+    """Execute a command that is not in the private catalogue.
+
+    The order of the cases matters: a key may be a surface, a list of fields or wavelengths, a
+    command of the whole lens, a solve, or a command of one surface. Other keys are ignored, refused
+    or noted as unknown.
+    """
     if (zoom := command.of("Z")) and str(reader.record.configuration) not in zoom:
         return  # for another zoom position, see `_zoom`
     record, use, line = reader.record, reader.record.use, command.line
@@ -198,8 +203,9 @@ def _take(reader: _Reader, command: Command) -> None:
 def read_seq(
     path: str, missing: Missing, lines: list[str], configuration: int | None = None
 ) -> Record:
-    """Read the lines of a `.seq` file into a record of its surfaces and their use. LensError with
-    the line. path: its name in messages. configuration: see `load_system`."""
+    """Read the lines of a `.seq` file into a record of its surfaces, fields, wavelengths and
+    aperture. LensError with the line. path: its name in messages. configuration: see
+    `load_system`."""
     reader, private, ended = _Reader(path, missing, configuration), False, False
     for own in commands_of(reader.record, lines):
         if ended:
@@ -246,7 +252,11 @@ def _finish(reader: _Reader) -> None:
 
 
 def _use(reader: _Reader) -> None:
-    """Write fields and wavelengths in the form of `System`."""
+    """Write fields and wavelengths in the form of `System`.
+
+    A list that is missing, or shorter than the number of fields or wavelengths, is filled up with
+    its default value; a longer one raises LensError.
+    """
     record, lists, lines = reader.record, reader.lists, reader.list_lines
     use, waves = record.use, record.use.wavelengths
 

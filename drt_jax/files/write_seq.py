@@ -81,7 +81,9 @@ def _zooms(texts: Sequence[Sequence[str]]) -> list[str]:
 
 
 def _lines(system: System) -> list[str]:
-    """The lines of one zoom position before GO."""
+    """The lines of one zoom position before GO: head, private glasses, fields and wavelengths, then
+    the surfaces with their decentres and tilts. A model glass off the normal line becomes a private
+    glass, with a warning of its error."""
     lens, worst = system.lens, 0.0
     require(not lens.afocal, ".seq files hold no afocal image space here: save as .yaml or .zmx")
     media, own = media_of_lens(lens)
@@ -278,7 +280,8 @@ def _places(lens: Lens) -> list[list[str]]:
 
     They are the values of the lens if it has no elements; the values of the elements if each
     rotates the axis at the vertex of its first surface and nothing else is moved; otherwise values
-    relative to the surface before.
+    relative to the surface before. For these, `point` and `turn` are the vertex and the axes that
+    the next surface has without a move, and the lines are its difference from them.
     """
     own, count = lens.elements, lens.count + 1
     places = [place_of(lens, i) for i in range(count)]

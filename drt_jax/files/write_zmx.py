@@ -229,6 +229,10 @@ def _with_breaks(
 ) -> tuple[list[list[str]], list[float]]:
     """Insert the coordinate breaks among the blocks of lines of the S surfaces and the image.
 
+    Each move of surfaces about a pivot becomes a break at the pivot in front of its first surface,
+    and the inverse break behind its last one. The thickness in front of a break leads along the
+    axis to its pivot, so that the thicknesses between two surfaces have the sum of their gap.
+
     gaps: (S,), thickness behind each surface, mm.
 
     Returns all blocks, and the thickness (mm) in front of each one. That in front of the first

@@ -167,8 +167,15 @@ def _positive(record: Record, line: int, value: float) -> float:
 def read_zmx(
     path: str, missing: Missing, lines: list[str], configuration: int | None = None
 ) -> Record:
-    """Read the lines of a `.zmx` file into a record of its surfaces and their use. LensError with
-    the line. path: its name in messages. configuration: see `load_system`."""
+    """Read the lines of a `.zmx` file into a record of its surfaces, fields, wavelengths and
+    aperture. LensError with the line.
+
+    `choose` first writes the numbers of the configuration into the lines. Lines before the first
+    SURF belong to the header, lines behind it to the last surface. The surfaces end at MNUM, at the
+    first line that is not indented, or at the first key of the merit function; the rest is ignored.
+
+    path: its name in messages. configuration: see `load_system`.
+    """
     record, surfaces, tail = Record(path, missing), list[Surface](), False
     head, found = Head(record), words_of(record, lines)
     choose(record, found, configuration)

@@ -74,7 +74,11 @@ def configuration(text: str) -> int | str:
 
 def output(options: argparse.Namespace, say: Callable[[str], None]) -> Iterator[Line]:
     """Yields the data of a lens, as lines and rows of tables, when they are computed; draws its
-    sheet. ValueError for wrong options. say: called with the name of each step."""
+    sheet. ValueError for wrong options. say: called with the name of each step.
+
+    The fast results come first: first-order data, then a file with the drawing, then spots and
+    warnings. The sheet or page with all analyses replaces the file at the end.
+    """
     if not all(abs(field) < 90 for field in options.field or ()):
         raise ValueError("--field: must be within 90 degrees")
     if options.configuration == "all":

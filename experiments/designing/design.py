@@ -240,7 +240,11 @@ def _foci(config: Config, lens: drt_jax.Lens) -> list[float]:
 
 
 def run(config: Config, run: Run) -> dict[str, Any]:
-    """Runs growth, searches and the last search, and writes the lens."""
+    """Runs growth, searches and the last search, and writes the lens.
+
+    Each of the three is a job of the run, whose result is stored: a run that is resumed continues
+    with the next one.
+    """
     start = config.load()
     start = design.open_apertures(start) if config.floating else start
     model = not config.glasses.makers or start.dispersion.model is not None

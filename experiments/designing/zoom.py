@@ -141,7 +141,11 @@ def focusing(systems: list[System], lenses: Sequence[drt_jax.Lens]) -> design.Fo
 
 
 def run(config: Config, run: Run) -> dict[str, Any]:
-    """Optimises the moving variables, then all, and writes the lens of each configuration."""
+    """Optimises the moving variables, then all, and writes the lens of each configuration.
+
+    With many starts, the best of their searches replaces the search of the moving variables. Each
+    search is a job whose result is stored, so that a run can be resumed after it.
+    """
     first = drt_jax.load_system(config.lens, configuration=1)
     count = range(1, first.configurations + 1)
     systems = [drt_jax.load_system(config.lens, configuration=k) for k in count]

@@ -127,7 +127,11 @@ def _distance(config: Config, shape: tuple[int, int]) -> Any:
 
 
 def run(config: Config, run: Run) -> dict[str, Any]:
-    """Renders the photograph."""
+    """Renders the photograph.
+
+    The side of a pixel is given, or follows from the focal length and the field in the corners.
+    `converge` chooses kernels and grid, `render` blurs the linear light, and noise is added last.
+    """
     pixels = _read("photo", config.photo)
     shape = pixels.shape[:2]
     lens = config.scene.load()

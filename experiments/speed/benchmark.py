@@ -201,7 +201,12 @@ def waves_curves(config: Config, of: Callable) -> dict[str, Any]:
 
 
 def bundle_task(config: Config) -> list[Row]:
-    """Skew rays through random points of the stop, one wavelength, to the sensor."""
+    """Skew rays through random points of the stop, one wavelength, to the sensor.
+
+    The error is the largest difference from a sequential trace of the first 1000 rays. batoid
+    traces the same rays from a plane in front of their first hits. Further rows are for several CPU
+    devices, for float32, and for the gradient.
+    """
     lens, field, distance = config.scene
     waves = jnp.asarray(config.wavelengths_um[:1])
     trace, points = config.bundle_trace

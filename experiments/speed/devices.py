@@ -49,7 +49,11 @@ class Config:
 
 
 def run(config: Config, run: Run) -> dict[str, Any]:
-    """Times the steps of all counts, in turns."""
+    """Times the steps of all counts, in turns.
+
+    For each count, a step on this number of devices is compared with one of the same images on a
+    single device: times, and the relative difference of the losses.
+    """
     side = config.patch + train.Camera.kernel - 1
     shape = config.images * max(config.counts), side, side, 3
     scenes = np.random.default_rng(0).integers(0, 255, shape, np.uint8)

@@ -110,7 +110,12 @@ def _broken_off(folder: pathlib.Path, way: _Way) -> str:
 def rows(
     parent: pathlib.Path, count: int, rngs: list[np.random.Generator]
 ) -> Iterator[dict[str, Any]]:
-    """Rows of runs that are ended `count` times in all, and of runs that are started twice."""
+    """Rows of runs that are ended `count` times in all, and of runs that are started twice.
+
+    The reference is an uninterrupted run. A third of the ends are kills at random times, a third
+    kills at writes, the rest signals. Each run is ended up to `_KILLS` times before it is resumed
+    to its end, and two runs work at a time.
+    """
     whole, numbers = parent / "whole", itertools.count()
     ended = _end_of(_start(whole))
     if ended.code:

@@ -110,6 +110,11 @@ class Walk(NamedTuple):
         return np.cos(angle) * d + np.sin(angle) * (flat if self.form else _across(rng, d))
 
     def __call__(self, rng, count, variant):
+        """`count` scenes that fit, of 200 times as many random ones.
+
+        From mirror to mirror it follows the chief ray (`point`, direction `d`), the vergence `near`
+        of the source for the next mirror, and the size of the beam there.
+        """
         mirrors, between = variant
         n, rows = 200 * count, _Rows(self.form)
         reach = rng.uniform(20, 80, n)

@@ -165,8 +165,8 @@ def test_rays_that_fail_are_told_apart(lens, points):
 
 @pytest.mark.parametrize("solver", [solve.solve, solve.solve_reverse])
 def test_memory_a_ray_keeps_for_the_backward_pass(lens, solver, monkeypatch):
-    """The hits and their validity, 16 + 1 bytes for each row, and the stop points; the rest does
-    not grow with the bundle."""
+    """For each ray the hits, 16 bytes a row, its status and its stop point; the rest does not grow
+    with the bundle."""
 
     def at_once(system, target):
         zero, rows = jnp.zeros_like(target[0]), len(system.forms)
