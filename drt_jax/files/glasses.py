@@ -77,7 +77,7 @@ def named_glass(
     except ValueError as error:
         if not found and beside and not spellings(own):
             numbers = " ".join(f"{key} {value:.7g}" for key, value in beside.items())
-            what = f"{row.name}: no catalogue has {short(name)}: {numbers}, as beside it"
+            what = f"{row.name}: no catalogue has {short(name)}: {numbers}, as in its line"
             row.record.note(line, what)
             return dict(beside)
         what = f"{error}; give nd and vd as a model glass in the file"

@@ -137,7 +137,7 @@ class Record:
         if self.solves:
             some = _listed(map(str, self.solves), 5)
             place = f"line{'s' * (len(self.solves) > 1)} {some}"
-            self.notes.append(f"{place}: solves and pickups are read as the values beside them")
+            self.notes.append(f"{place}: solves and pickups are read as their present values")
         if self.unknown:
             some = _listed([f"{key} (line {line})" for key, line in self.unknown.items()], 8)
             self.notes.append(f"{what} that are not known: {some}")

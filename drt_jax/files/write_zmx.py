@@ -195,7 +195,7 @@ def _apertures(lens: Lens, i: int) -> list[str]:
     if others and (kind != "circle" or blocks or others != ring):
         own = " and ".join(f"{'a blocking' if s[0] else 'a clear'} {s[1]}" for s in shapes)
         what = f"surfaces[{i}]: has {own}; a .zmx surface has one aperture, or a blocking circle in"
-        remedy = "put the others on plane surfaces of their own beside it, or save as .yaml"
+        remedy = "put the others on plane surfaces next to it, or save as .yaml"
         raise LensError(f"{what} a clear one of its centre: {remedy}")
     word = APERTURES[kind][blocks]
     if kind == "polygon":

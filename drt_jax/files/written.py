@@ -159,7 +159,7 @@ def medium_of(lens: Lens, i: int) -> dict[str, Any] | None:
     """Prescription keys of medium i; None if it can be described only by its constants."""
     own = constants_of(lens.dispersion, i)
     if lens.dispersion.model is not None and lens.dispersion.model[i, 0] != 1:
-        what = f"glasses[{i}]: a prescription has no constants beside nd and vd"
+        what = f"glasses[{i}]: a prescription has nd and vd and no other constants"
         require(not own.keys() - {"range"}, what)
         nd, vd = np.asarray(lens.dispersion.model[i]).tolist()
         dPgF = lens.dispersion.dPgF

@@ -65,7 +65,7 @@ WRONG = {
         ("train.variables=[sensor 1]", "such as curvature 0, got 'sensor 1'"),
         ("train.variables=[curvature 9]", "train.variables: curvature: no surface 9; there"),
         ("train.variables=[curvature, curvature 1]", "variables: curvature 1 stands twice"),
-        ("train.variables=[coefficients]", "coefficients: the lens has none; write them"),
+        ("train.variables=[coefficients]", "coefficients: the lens has none; add some"),
         ("scene.field=90", "scene.field: expected -89 to 89, got 90"),
         ("scene.field=[1, 2, 3]", "scene.field: expected one angle in degrees, or [x, y]"),
     ],

@@ -389,7 +389,7 @@ def test_listed_double_gauss(tmp_path):
     """CODE V 10.8 for its own file: indices, first-order data, rays, to the last printed digit."""
     path = tmp_path / "gauss.seq"
     path.write_text(GAUSS)
-    with pytest.warns(UserWarning, match=r"line 16: solves and pickups are read as the values"):
+    with pytest.warns(UserWarning, match=r"line 16: solves and pickups are read as their"):
         system = load_system(path)
     glasses = np.asarray(system.lens.index(system.wavelengths))[[1, 3, 4, 8]]
     listed = [[1.618769, 1.622292, 1.630455], [1.604134, 1.607379, 1.614860]]

@@ -174,7 +174,7 @@ def test_what_a_prescription_cannot_hold(tmp_path):
         save_lens(curved, tmp_path / "lens.yaml")
     patent = load_lens({"surfaces": [{"radius": 9, "nd": 1.5, "vd": 50, "thickness": 9} | STOP]})
     melted = dataclasses.replace(patent.dispersion, strength=patent.dispersion.strength + 1e-6)
-    with pytest.raises(LensError, match=r"glasses\[1\]: a prescription has no constants beside nd"):
+    with pytest.raises(LensError, match=r"glasses\[1\]: a prescription has nd and vd and no"):
         save_lens(dataclasses.replace(patent, dispersion=melted), tmp_path / "lens.yaml")
     with pytest.raises(LensError, match="cannot be written"):
         save_lens(lens, tmp_path / "nowhere" / "lens.yaml")
