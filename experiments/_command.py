@@ -20,13 +20,14 @@ from . import _common, _sharing
 from .runs import config as configs
 from .runs.folder import Run, begun
 
-# Errors raised in these folders are about the input; others are faults, shown with a traceback.
+# Errors that are raised in these folders are about the input; others are bugs, shown with a
+# traceback.
 _OURS = (pathlib.Path(drt_jax.__file__).parent, pathlib.Path(__file__).parent)
 
 
 def _left(folder: pathlib.Path | None) -> tuple[str, str]:
-    """What a run folder holds if the command ends now, and how to continue, as text; "" for
-    nothing. None for a folder that is not known yet."""
+    """Two texts: the state of a run folder if the command ends now, and how to continue, "" if the
+    run has not started. folder: None if it is not known yet."""
     if not (folder and (folder / "config.yaml").is_file()):
         return "nothing was begun", ""
     if (folder / "results.json").is_file():
@@ -38,9 +39,9 @@ def main(experiment: Any, argv: list[str] | None = None) -> None:
     """Runs an experiment; with --report only draws and prints the results of a run again.
 
     experiment: a module with `Config`, the dataclass of its settings; `COLUMNS` of metrics.csv, if
-        it trains, to which `columns` of its settings add; `run(config, run)`, which returns results
-        for `Run.finish`; `tables(results)`, which are printed; and `draw(results, folder)` of
-        figures.
+        it trains, and `columns` of its settings for further ones; `run(config, run)`, which returns
+        the results for `Run.finish`; `tables(results)`, which are printed; and
+        `draw(results, folder)`, which draws the figures.
     argv: arguments of the command line.
     """
     name, folder = experiment.__spec__.name.split(".")[-1], None
@@ -87,7 +88,7 @@ def _do(name: str, experiment: Any, options: argparse.Namespace, folder: pathlib
             with Run(own, config, sum(columns, ()), options.resume) as run:
                 print(f"{name}: run folder {own}")
                 run.finish(experiment.run(config, run))
-        if own != folder:  # the first process goes on alone
+        if own != folder:  # only the first process continues
             return []
     results, figures = _common.read_results(folder), folder / "figures"
     figures.mkdir(exist_ok=True)

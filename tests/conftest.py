@@ -1,5 +1,5 @@
-"""Tests run in float64, under strict promotion of dtypes and ranks, and with warnings as errors:
-nothing may change precision or shape silently."""
+"""Tests run in float64, with strict promotion of dtypes and ranks and with warnings as errors, so
+that no precision or shape changes silently."""
 
 import gc
 import itertools
@@ -23,20 +23,20 @@ jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 jax.config.update("jax_numpy_rank_promotion", "raise")
 
-# Tests that run the same program again, in this process or another, need not compile it again.
+# Tests that run the same program again, in this process or another, do not compile it again.
 if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
     _cache = tempfile.TemporaryDirectory(prefix="drt-jax-compiled-")
     os.environ["JAX_COMPILATION_CACHE_DIR"] = _cache.name
 jax.config.update("jax_compilation_cache_dir", os.environ["JAX_COMPILATION_CACHE_DIR"])
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
 
-# JAX makes many small objects that live long: a search for garbage among them seldom finds any, and
+# JAX makes many small objects that live long. Garbage collection rarely frees any of them, and
 # takes a seventh of the time of the tests.
 gc.set_threshold(100_000, 20, 20)
 
-# All slow tests take longer than CI may: it runs another seventh of them for another commit.
+# All slow tests take longer than CI allows: it runs one seventh of them, depending on the commit.
 PARTS = 7
-# Files whose cases share no programs: these, too, are apart.
+# Files whose cases share no programs; these may be separated, too.
 APART = ("test_pages.py", "test_starts.py")
 LONGEST = ("test_readme.py", "test_experiments.py", "test_derivatives.py")
 RGB = (0.6, 0.53, 0.48)
@@ -44,23 +44,23 @@ LENSES = ("double_gauss", "double_gauss_addon", "cooke_triplet", "singlet")
 
 
 def pytest_addoption(parser):
-    """Adds --write-tables: the tests that make a table of `results` write it there; and --part and
-    --times.
-    """
+    """Adds --write-tables, with which tests that make a table of `results` write it there; and
+    --part and --times."""
     parser.addoption("--write-tables", action="store_true", help="rewrite the tables in results/")
     parser.addoption("--part", type=int, choices=range(PARTS), help="a seventh of the slow tests")
     parser.addoption("--times", metavar="FILE", help="where the time goes, see times.py")
 
 
 def pytest_configure(config):
-    """Times the tests with --times."""
+    """Measures the times of the tests with --times."""
     if config.getoption("--times"):
         config.pluginmanager.register(Times(config.getoption("--times")))
 
 
 def pytest_collection_modifyitems(config, items):
-    """Files with long tests first: none is left for one worker alone at the end. With `--part`,
-    every seventh slow function; the cases of one share programs, but for those of `APART`."""
+    """Sorts files with long tests to the front, so that none is left for a single worker at the
+    end. With `--part`, selects every seventh slow function. The cases of one function share
+    programs and stay together, except those of `APART`."""
     items.sort(key=lambda item: item.path.name not in LONGEST)
     part = config.getoption("--part")
     if part is None:
@@ -81,7 +81,7 @@ def write_tables(request) -> bool:
 
 @pytest.fixture
 def shared() -> pathlib.Path:
-    """Reference data kept beside the checkout; the test is skipped where there is none."""
+    """Folder of reference data next to the checkout; the test is skipped if there is none."""
     path = pathlib.Path(__file__).resolve().parents[2] / "shared" / "data"
     if not path.is_dir():
         pytest.skip("no reference data beside the checkout")
@@ -90,15 +90,16 @@ def shared() -> pathlib.Path:
 
 @pytest.fixture(scope="session", autouse=True)
 def ctrl_c() -> Iterator[None]:
-    """Ctrl-C is heard, also where the tests were started with SIGINT ignored (`nohup`, some CI):
-    some of them press it."""
+    """Handles Ctrl-C also if the tests were started with SIGINT ignored (`nohup`, some CI), because
+    some tests send it."""
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     yield
     signal.signal(signal.SIGINT, before)
 
 
 def assert_close(ours, wanted, rtol, floor=0.0):
-    """Each array of a tree within `rtol` of the largest element of the other's, plus `floor`."""
+    """Asserts that each array of a tree agrees with the other within `rtol` of the largest element
+    of the other, plus `floor`."""
     for a, b in zip(jax.tree.leaves(ours), jax.tree.leaves(wanted), strict=True):
         assert a.shape == b.shape
         size = np.max(np.abs(b), initial=0)
@@ -107,9 +108,9 @@ def assert_close(ours, wanted, rtol, floor=0.0):
 
 @pytest.fixture(autouse=True, scope="module")
 def room_for_programs():
-    """Drops all compiled programs when they take 4 GB: the tests of all files share them until
-    then, some 12,000 of the 65,530 pieces that Linux lets a process map. What is kept is not looked
-    through again for garbage."""
+    """Drops all compiled programs when they take 4 GB; until then the tests of all files share
+    them. These are some 12,000 of the 65,530 memory maps that Linux allows for a process. The
+    garbage collector does not search the objects that are kept again."""
     yield
     sizes = pathlib.Path("/proc/self/statm")  # the second number: pages in memory
     if not sizes.exists() or int(sizes.read_text().split()[1]) * resource.getpagesize() > 4e9:

@@ -18,15 +18,15 @@ FLAGS = (
 
 
 def known(flag: str) -> bool:
-    """Whether this XLA knows a flag, or several: a process that gives it another is aborted."""
+    """Whether this XLA knows a flag, or several; XLA aborts a process with an unknown flag."""
     ask = [sys.executable, "-c", "import jax; jax.devices('cpu')"]
     flags = {"XLA_FLAGS": flag, "JAX_PLATFORMS": "cpu"}
     return not subprocess.run(ask, env=os.environ | flags, capture_output=True).returncode
 
 
 def set_flags() -> None:
-    """Sets them for backends that start from now on, here and in other processes, unless
-    `XLA_FLAGS` is given."""
+    """Sets the flags for backends that start later, here and in new processes, unless `XLA_FLAGS`
+    is set."""
     if "XLA_FLAGS" not in os.environ:
         together = " ".join(FLAGS)
         os.environ["XLA_FLAGS"] = together if known(together) else " ".join(filter(known, FLAGS))

@@ -1,9 +1,9 @@
-"""Answers of all analyses as numbers, kept in golden.json: to tell that code which moved computes
-what it computed before.
+"""Results of all analyses as numbers, stored in golden.json, to check that code which only moved
+gives the same results.
 
 `python -m tests.golden` computes them again and names each that differs, with the difference
-relative to the largest number of the answer; `--write` keeps the new ones. A scene takes some
-minutes, nearly all of it compilation; `--scenes` picks some (without it, those that are kept).
+relative to the largest number of the result; `--write` stores the new ones. A scene takes some
+minutes, nearly all of it compilation; `--scenes` selects some (by default those that are stored).
 """
 
 import argparse
@@ -34,7 +34,7 @@ SCENES = {
     "double_gauss_addon": ((0.0, 8.0, 14.0), 3000.0, 0.01, False),
     "fisheye_8mm": ((0.0, 40.0, 60.0), np.inf, 0.01, False),
 }
-# Analyses whose gradients by these arrays of the lens are kept, too.
+# Analyses for which gradients by these arrays of the lens are stored, too.
 SLOPES = ("rays", "moments", "distortion", "spot_diagram", "transfer", "psf_waves", "psf_rays")
 MOVED = ("curvature", "thickness")
 
@@ -112,8 +112,8 @@ def weights(count: int) -> np.ndarray:
 
 
 def number(array: Any) -> float:
-    """A weighted sum of the numbers of an array; 1000 stands for what is not finite, so that it
-    shows."""
+    """A weighted sum of the numbers of an array, in which 1000 replaces numbers that are not
+    finite, so that these are noticed."""
     flat = np.ravel(np.asarray(array))
     flat = np.concatenate([flat.real, flat.imag]) if np.iscomplexobj(flat) else flat.astype(float)
     return float(weights(flat.size) @ np.where(np.isfinite(flat), flat, 1e3))
@@ -141,7 +141,7 @@ def slope(function: Callable[[drt.Lens], Any], lens: drt.Lens) -> dict[str, Any]
 
 
 def answers(scene: str, wanted: Callable[[str], bool]) -> Iterator[tuple[str, float, float]]:
-    """Names, numbers and scales of the answers of a scene by the analyses that are wanted."""
+    """Names, numbers and scales of the results of the selected analyses for a scene."""
     lens = drt.load_lens(scene)
     for name, function in analyses(scene).items():
         if not wanted(name):
@@ -154,8 +154,8 @@ def answers(scene: str, wanted: Callable[[str], bool]) -> Iterator[tuple[str, fl
 
 
 def differences(scene: str, wanted: Callable[[str], bool] = lambda name: True) -> dict[str, float]:
-    """For each answer that is not the kept number to the last digit: by how much it differs,
-    relative to its scale; inf for an answer that is new."""
+    """For each result that differs from the stored number in the last digit: the difference
+    relative to its scale; inf for a new result."""
     kept, found = json.loads(FILE.read_text())[scene], {}
     for name, value, size in answers(scene, wanted):
         before = float.fromhex(kept[name]) if name in kept else np.inf
@@ -165,7 +165,7 @@ def differences(scene: str, wanted: Callable[[str], bool] = lambda name: True) -
 
 
 def main() -> None:
-    """Compares the answers, or writes them."""
+    """Compares the results, or writes them."""
     parser = argparse.ArgumentParser(prog="tests.golden", description=__doc__)
     parser.add_argument("--scenes", nargs="+", choices=SCENES)
     parser.add_argument("--write", action="store_true")

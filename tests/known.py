@@ -1,5 +1,5 @@
-"""Rays searched for by one program and known to all others: a program that only differentiates
-rays need not hold the search for them, which is most of what there is to compile."""
+"""Rays that one program searches for and all others use: a program that only differentiates rays
+then does not contain the search, which takes most of the compilation."""
 
 import dataclasses
 import functools
@@ -14,12 +14,12 @@ from drt_jax.rays.trace import aims
 
 
 def freed(lens):
-    """The lens with nothing held: derivatives by the stop and by glasses, too."""
+    """The lens with all numbers free: also derivatives by the stop and by glasses."""
     return dataclasses.replace(lens, free=tuple(HELD))
 
 
 def bendable(lens):
-    """The lens with derivatives by all numbers: every row may be curved, and nothing is held."""
+    """The lens with derivatives by all numbers: every row may be curved, and no number is held."""
     return dataclasses.replace(freed(lens), curved=tuple(range(lens.count + 1)))
 
 
@@ -30,16 +30,16 @@ def search(lens, scene, points):
 
 
 def known(found):
-    """A solver for `trace_bundle` and `moments` that has found its rays: all derivatives."""
+    """A solver for `trace_bundle` and `moments` with known rays; it supports all derivatives."""
     return functools.partial(reattach, found)
 
 
 def check_slopes(program, lens, steps, rtol):
-    """Gradients against central differences of the fourth order, along one random direction of each
-    kind of numbers.
+    """Compares gradients with central differences of the fourth order, along one random direction
+    of each kind of numbers.
 
-    program: lens -> ((value, anything), gradient), one for all. steps: by kind, the size of a step;
-    numbers that are 0 or infinite stay.
+    program: function of the lens that returns ((value, anything), gradient), for all. steps: by
+    kind, the size of a step; numbers that are 0 or infinite do not change.
     """
     gradient = program(lens)[1]
     for seed, (name, step) in enumerate(steps.items()):

@@ -32,8 +32,8 @@ SCENE = ("field", "distance")
 @dataclasses.dataclass(frozen=True)
 class Scene:
     """A lens and its object. `values`: the arrays of a `drt_jax.Lens` by name, those of its
-    dispersion, field (2,) and distance (). joined (S,): surfaces with the same glass on both
-    sides and no mirror, which are off the path."""
+    dispersion, field (2,) and distance (). joined (S,): surfaces with the same glass on both sides
+    and no mirror, which are left out of the path."""
 
     values: dict[str, np.ndarray]
     stop: int
@@ -63,19 +63,19 @@ class Scene:
 
     @classmethod
     def stack(cls, scenes):
-        """Scenes of one structure as one with a leading axis."""
+        """Scenes of one structure, stacked along a leading axis."""
         first = scenes[0]
         arrays = {k: np.stack([each.values[k] for each in scenes]) for k in first.values}
         return dataclasses.replace(first, values=arrays)
 
 
 def _wide(value):
-    """A parameter (...) against (..., wavelength, ray)."""
+    """A parameter (...), broadcast against (..., wavelength, ray)."""
     return np.asarray(value)[..., None, None]
 
 
 def _rotate(v, axis, angle):
-    """The vector `v` turned right-handed about a coordinate axis."""
+    """The vector `v` rotated right-handed about a coordinate axis."""
     cosine, sine = np.cos(angle), np.sin(angle)
     p, q = (axis + 1) % 3, (axis + 2) % 3
     turned = [None] * 3
@@ -110,10 +110,10 @@ def vertices(scene):
 
 
 class Trace(NamedTuple):
-    """own, hits: triples along the axes of each surface and along those of the lens, S + 1 each;
-    path (..., W, Q), mm; good (..., W, Q): real rays that meet every surface, the sensor and the
-    dummies, from the front, forwards from active surface to active surface, and without total
-    reflection."""
+    """own, hits: components x, y, z along the axes of each surface and along those of the lens, S +
+    1 each; path (..., W, Q), mm; good (..., W, Q): real rays that meet every surface, the sensor
+    and the dummies from the front, run forwards from active surface to active surface, and are not
+    totally reflected."""
 
     own: list
     hits: list
@@ -137,7 +137,7 @@ def _bend(d, slopes, ratio, mirror):
 
 
 def _from_source(point, v, tangent):
-    """|P - P0| - |P0| for P0 = -(tangent, 1) / v, by the difference of two squares."""
+    """|P - P0| - |P0| for P0 = -(tangent, 1) / v, from the difference of two squares."""
     source = [-tangent[0], -tangent[1], -1.0]
     first = [v * a - b for a, b in zip(point, source)]
     top = sum(v * a**2 - 2 * a * b for a, b in zip(point, source))
@@ -202,9 +202,9 @@ def trace(scene, x, y, stop_only=False):
 
 @np.errstate(all="ignore")
 def reach(scene, pupil):
-    """Where rays (..., W, Q) through the stop points `pupil` (2, Q) enter; the 2 x 2 inverse of
-    how the stop point follows; and whether the last Newton step was rounding. The scene is real.
-    Field and aperture are opened in steps."""
+    """Launch of the rays (..., W, Q) through the stop points `pupil` (2, Q); the 2 x 2 inverse of
+    the derivative of the stop point by the launch; and whether the last Newton step was within
+    rounding. The scene is real. Field and aperture are increased in steps."""
     lead = np.broadcast_shapes(*(scene.values[k].shape[:-1] for k in ("field", "curvature")))
     shape = (*lead, len(scene.wavelengths), pupil.shape[1])
     radius = _wide(scene.values["semi_diameter"][..., scene.stop])
@@ -227,7 +227,7 @@ def reach(scene, pupil):
 
 
 def _aimed(scene, pupil):
-    """The first three results of `reach`; ArithmeticError where there is no ray."""
+    """The first three results of `reach`; ArithmeticError if there is no ray."""
     *start, settled = reach(scene, pupil)
     if not np.all(settled):
         raise ArithmeticError(f"{np.sum(~settled)} rays do not reach the stop")
@@ -235,8 +235,8 @@ def _aimed(scene, pupil):
 
 
 def aim(scene, pupil, start=None):
-    """(x, y), (..., W, Q), of the rays through the stop points `pupil` (2, Q), in units of the
-    stop's semi-diameter. The scene may be complex; `start`, the result of `_aimed`."""
+    """Launch (x, y), (..., W, Q), of the rays through the stop points `pupil` (2, Q), in units of
+    the stop's semi-diameter. The scene may be complex; `start`: result of `_aimed`."""
     plain = scene.replace(**{k: np.real(v) for k, v in scene.values.items()})
     x, y, inverse = _aimed(plain, pupil) if start is None else start
     radius = _wide(scene.values["semi_diameter"][..., scene.stop])
@@ -294,8 +294,8 @@ def outputs(scene, rule, symmetry, points, starts=(None, None)):
 
 
 def jacobian(scene, rule, symmetry, points, names):
-    """{output: {parameter: array, shape of the output + shape of the parameter}}, all elements
-    of the parameters `names` by a complex step."""
+    """{output: {parameter: array, shape of the output + shape of the parameter}}, by all elements
+    of the parameters `names`, with a complex step."""
     starts = _aimed(scene, rule[0]), _aimed(scene, points)
     jacobians = {}
     for name in names:

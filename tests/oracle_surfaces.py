@@ -1,4 +1,4 @@
-"""The surfaces of `oracle`: sags, slopes, and where a ray crosses them; plain NumPy, analytic."""
+"""The surfaces of `oracle`: sags, slopes, and intersections with rays; plain NumPy, analytic."""
 
 import numpy as np
 
@@ -7,7 +7,7 @@ RIM = 1e-4
 
 
 def _powers(x, count):
-    """1, x, x^2, ... by multiplication: exact for an imaginary part of 1e-30."""
+    """1, x, x^2, ... by multiplication, which is exact for an imaginary part of 1e-30."""
     powers = [np.ones_like(x)]
     for _ in range(count):
         powers.append(powers[-1] * x)
@@ -74,8 +74,8 @@ def dot(a, b):
 
 
 def _to_conic(p, d, c, k):
-    """Real distance along p + s d to the conic of c and k, where the ray crosses it from the
-    side where its vertex plane lies in front; to the vertex plane if it misses the conic."""
+    """Real distance along p + s d to the conic of c and k, where the ray crosses it from the side
+    on which its vertex plane lies in front; to the vertex plane if the ray misses the conic."""
     p, d, c, k = ([np.real(a) for a in p], [np.real(a) for a in d], np.real(c), np.real(k))
     plane = -p[2] / d[2]
     p = [p[0] + plane * d[0], p[1] + plane * d[1]]
@@ -92,7 +92,7 @@ def _to_conic(p, d, c, k):
 
 
 def _rim(form, x, y, c, k, a):
-    """What must stay above `RIM` on the surface."""
+    """The quantity that must be above `RIM` on the surface."""
     if form == "biconic":
         return 1 - (1 + a[1]) * a[0] ** 2 * x**2 - (1 + k) * c**2 * y**2
     if form == "toroid":
@@ -102,7 +102,8 @@ def _rim(form, x, y, c, k, a):
 
 
 def cross(form, p, d, shape):
-    """Where p + s d crosses a surface: the point, the slopes there, s, and whether it does."""
+    """Intersection of p + s d with a surface: the point, the slopes there, s, and whether there is
+    one."""
     conic = form in ("asphere", "odd_asphere", "polynomial_xy")
     s = (_to_conic(p, d, *shape[:2]) if conic else -p[2] / d[2]) + 0j
     for _ in range(14):

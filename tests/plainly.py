@@ -1,5 +1,5 @@
-"""The main calls of the library as another kind of device sees them: without what was chosen for
-CPUs. Run by test_devices.py with JAX_ENABLE_X64 on and off; prints numbers as JSON."""
+"""The main calls of the library as on another kind of device: without the options that were chosen
+for CPUs. Run by test_devices.py with JAX_ENABLE_X64 on and off; prints numbers as JSON."""
 
 import json
 import sys

@@ -1,5 +1,5 @@
-"""What eight devices share, beside one: run by test_devices.py in a process with virtual devices;
-prints the largest differences as JSON."""
+"""Work divided among eight devices, compared with one device: run by test_devices.py in a process
+with virtual devices; prints the largest differences as JSON."""
 
 import dataclasses
 import json

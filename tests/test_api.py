@@ -1,5 +1,5 @@
-"""What the public functions say of arguments that mean nothing: an error that names the remedy
-where values are known, and inside a trace finite numbers with a status that tells."""
+"""Public functions with invalid arguments: an error that names the remedy if values are known;
+inside a trace finite numbers with a status that shows the failure."""
 
 import dataclasses
 import warnings
@@ -50,7 +50,7 @@ OF_FIELD, OF_DISTANCE = list(CALLS)[:13], list(CALLS)[:15]
 
 
 def refused(name, *arguments):
-    """The message of the error, one line."""
+    """The error message, which must have one line."""
     with pytest.raises(ValueError) as caught:
         CALLS[name](*arguments)
     text = str(caught.value)
@@ -74,7 +74,7 @@ def test_fields_of_90_degrees_and_more_are_refused(name):
 
 @pytest.mark.parametrize("name", OF_DISTANCE)
 def test_an_object_at_the_first_vertex_is_refused(name):
-    """In front of it, and behind it (virtual), an object may lie."""
+    """An object may be in front of the vertex, or behind it (virtual)."""
     for distance in (0.0, -0.0, np.nan, 1e-7, np.float32(-1e-7), jnp.array(1e-7)):
         assert "must be 1e-06 mm or more" in refused(name, 0.05, distance, GREEN, POINTS)
     for distance in ("far", None, 1j):
@@ -175,7 +175,7 @@ def test_orders_and_symmetries_that_no_rule_has_are_refused():
 
 @jax.jit
 def everything(lens, field, distance, wavelengths):
-    """Rays and moments, and the gradient of their sum by all four."""
+    """Rays and moments, and the gradient of their sum by all four arguments."""
 
     def total(lens, field, distance, wavelengths):
         scene = field, distance, wavelengths
@@ -203,7 +203,7 @@ NOWHERE = {
 @pytest.mark.slow
 @pytest.mark.parametrize("name", NOWHERE)
 def test_no_light_comes_from_where_the_lens_cannot_see(name):
-    """Status MISSED, nothing passes, the blur is infinite, derivatives are 0; no NaN."""
+    """Status MISSED, a throughput of 0, an infinite blur, derivatives of 0; no NaN."""
     scene = [jnp.asarray(value, float) for value in (*NOWHERE[name], GREEN)]
     slopes, (found, status, spot) = everything(LENS, *scene)
     assert np.all(status == Status.MISSED)
@@ -238,7 +238,7 @@ def gaussian_optics(lens, field, distance, wavelengths):
 
 
 def test_gaussian_optics_has_no_nan():
-    """inf for what cannot be, inside a trace; outside an error."""
+    """inf for undefined values inside a trace; an error outside."""
     good = gaussian_optics(LENS, jnp.asarray(0.05), jnp.asarray(25e3), jnp.asarray(GREEN))
     assert all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(good))
     for field, distance in (*NOWHERE.values(), *EXTREME):
@@ -324,7 +324,7 @@ def test_surfaces_that_cross_after_a_step_of_an_optimiser_are_named():
 
 @pytest.mark.slow
 def test_a_wrong_field_in_an_eager_gradient_is_named():
-    """Its values are known there, too."""
+    """Its values are known in an eager gradient, too."""
     slope = jax.grad(
         lambda field: psf_moments(LENS, Scene.point(field, np.inf, GREEN), sampling=RULE).mean[0, 1]
     )
@@ -335,7 +335,7 @@ def test_a_wrong_field_in_an_eager_gradient_is_named():
 
 @pytest.mark.slow
 def test_random_lenses_give_finite_moments_or_an_error():
-    """And no RuntimeWarning of NumPy, which would be an error here."""
+    """And there is no RuntimeWarning of NumPy, which would be an error here."""
     rng, results = np.random.default_rng(0), []
     for _ in range(40):
         moved = {
@@ -359,7 +359,7 @@ def test_random_lenses_give_finite_moments_or_an_error():
 
 @pytest.mark.slow
 def test_the_promise_of_float32_is_kept_and_warned_of():
-    """Double Gauss at 10 degrees, a spot of 4.7 um, where it was once missed by 1.4e-3."""
+    """Double Gauss at 10 degrees, a spot of 4.7 um, whose error once was 1.4e-3."""
     double = dataclasses.replace(load_lens("double_gauss"), sensor=jnp.asarray(133.35))
     single = jax.tree.map(lambda a: a.astype(jnp.float32), double)
     scene = np.radians(10), 25e3, (0.6, 0.53, 0.48)

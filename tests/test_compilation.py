@@ -1,4 +1,4 @@
-"""Options of XLA are used where the backend knows them, and are in nobody's way elsewhere."""
+"""Options of XLA are used if the backend knows them, and are not used otherwise."""
 
 import os
 import subprocess
@@ -35,7 +35,7 @@ def test_a_program_with_options_is_part_of_another(outer):
 
 @pytest.mark.parametrize("given", ["", "named"])
 def test_programs_are_kept_for_the_next_process(tmp_path, given):
-    """In the user's cache, or in a folder that is named; a second process compiles nothing anew."""
+    """In the user's cache, or in a given folder; a second process compiles nothing anew."""
     argument = str(tmp_path / "named") if given else None
     code = (
         "import jax, jax.numpy as jnp, drt_jax\n"
@@ -58,7 +58,7 @@ def test_programs_are_kept_for_the_next_process(tmp_path, given):
 
 
 def test_importing_starts_no_backend():
-    """A user may still choose one, or begin `jax.distributed`."""
+    """After the import a user may still choose a backend, or start `jax.distributed`."""
     code = (
         "import drt_jax.design, drt_jax.learn.train, drt_jax.show, jax\n"
         "jax.config.update('jax_platforms', 'none such')\n"

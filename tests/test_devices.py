@@ -1,4 +1,5 @@
-"""Work that several devices share is that of one. On virtual devices of the CPU."""
+"""Work that is divided among several devices gives the results of one device. On virtual devices of
+the CPU."""
 
 import json
 import os
@@ -30,7 +31,7 @@ TOY = [
 
 
 def started(*words, count=1, **own):
-    """A process with `count` virtual devices."""
+    """Starts a process with `count` virtual devices."""
     parts = [str(HERE.parent), os.environ.get("PYTHONPATH", "")]
     own |= {"JAX_NUM_CPU_DEVICES": str(count), "PYTHONPATH": os.pathsep.join(filter(None, parts))}
     pipe = subprocess.PIPE
@@ -40,7 +41,7 @@ def started(*words, count=1, **own):
 
 
 def ended(process):
-    """What a process that must succeed has printed."""
+    """The output of a process, which must succeed."""
     out, err = process.communicate(timeout=1200)
     assert process.returncode == 0, err
     return out
@@ -103,8 +104,7 @@ def test_eight_devices_compute_what_one_does():
 
 @pytest.mark.slow
 def test_without_what_suits_cpus_and_in_float32_the_numbers_are_the_same():
-    """As another kind of device computes them: spots, slopes, rays, a kernel, lenses as built,
-    training."""
+    """As on another kind of device: spots, slopes, rays, a kernel, as-built lenses, training."""
     double, single = (
         json.loads(ended(started(str(HERE / "plainly.py"), JAX_ENABLE_X64=x)).splitlines()[-1])
         for x in "10"
@@ -123,7 +123,7 @@ def free_port():
 
 @pytest.mark.slow
 def test_a_run_of_two_processes_whose_one_is_killed_goes_on_with_one(tmp_path):
-    """The loss curve is that of one device: before the kill, and after it."""
+    """The loss curve is that of one device, before the kill and after it."""
     alone, both = tmp_path / "alone", tmp_path / "both"
     words = ["-m", "experiments.restore", "--out"]
     ended(started(*words, str(alone), "--set", *TOY))

@@ -1,4 +1,4 @@
-"""A few answers of golden.json in CI; `python -m tests.golden` compares all of them."""
+"""Some results of golden.json in CI; `python -m tests.golden` compares all of them."""
 
 import json
 
@@ -21,6 +21,6 @@ def test_what_is_kept_is_what_is_asked():
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:the sensor")
 def test_a_moved_house_computes_what_it_did():
-    """To rounding, which differs from one processor to another."""
+    """Within rounding, which differs between processors."""
     apart = golden.differences("double_gauss", QUICK.__contains__)
     assert all(size < 1e-10 for size in apart.values()), apart

@@ -1,4 +1,5 @@
-"""What enters: every wrong input is refused in one line that names file, line, key and remedy."""
+"""Input from outside: every invalid input raises an error of one line that names file, line, key
+and remedy."""
 
 import dataclasses
 import time
@@ -25,7 +26,7 @@ DIGITS = "9" * 5000
 BOMB = "a: &a [x, x, x, x, x, x, x, x, x]\n" + "".join(
     f"{b}: &{b} [{', '.join(['*' + a] * 9)}]\n" for a, b in zip("abcdefgh", "bcdefghi")
 )
-# What is replaced in the file, by what, and what the message says.
+# The replaced text of the file, its replacement, and the message.
 LENSES = {
     "number of 400 digits": ("51.68", "9" * 400, "line 3: a number of 400 characters"),
     "5000 digits": ("4.0", DIGITS, "line 3: a number of 5000 characters"),
@@ -83,7 +84,7 @@ LENSES = {
 
 
 def refused(call, kind):
-    """The message of an error of this kind: one line, short, at once."""
+    """The message of an error of this kind, which must be one short line."""
     start = time.perf_counter()
     with pytest.raises(kind) as error:
         call()
@@ -194,7 +195,7 @@ def test_messages():
 
 @pytest.mark.parametrize("seed", range(2))
 def test_random_mutants(seed, tmp_path):
-    """A few of those of `experiments.faults`."""
+    """Some of the damaged files of `experiments.faults`."""
     rng = np.random.default_rng(seed)
     path = tmp_path / "mine.yaml"
     for _ in range(40):

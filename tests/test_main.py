@@ -16,7 +16,7 @@ from drt_jax.show.layout import beam_of
 
 @pytest.fixture
 def undrawn(monkeypatch):
-    """Words without the sheet, which takes longer than they do; see tests/show/test_sheet.py."""
+    """The printed lines without the sheet, which takes longer; see tests/show/test_sheet.py."""
     monkeypatch.setattr("drt_jax.show.command.sheet", lambda *_: show.new()[0])
 
 
@@ -51,8 +51,8 @@ surfaces:
 
 @pytest.mark.slow
 def test_a_rim_that_shaves_the_axial_beam_is_named_wherever_it_matters(tmp_path, capsys, undrawn):
-    """0.8 % were cut by "none", and a warning said that apertures cut. Spots are those of
-    `psf_moments`, cells do not run together, and what is far from focus is said."""
+    """0.8 % were vignetted by "none", and a warning said that apertures vignette. Spots are those
+    of `psf_moments`, cells of the table are separate, and a large defocus is reported."""
     (tmp_path / "mine.yaml").write_text(RIM)
     words = ["show", str(tmp_path / "mine.yaml"), "--field", "0", "9", "--wavelengths", "0.55"]
     main([*words, "--out", str(tmp_path / "lens.png")])
@@ -86,7 +86,7 @@ def test_what_is_known_is_said_before_the_rays_are_traced(monkeypatch, tmp_path,
 
 @pytest.mark.slow
 def test_what_looks_odd(tmp_path, capsys, undrawn):
-    """A near object, out of focus; a field from which no light comes."""
+    """A near object, out of focus; a field without light."""
     words = ["show", "singlet", "--field", "0", "80", "--wavelengths", "0.55"]
     main([*words, "--distance", "200", "--out", str(tmp_path / "lens.png")])
     said = capsys.readouterr().out
@@ -109,8 +109,8 @@ sensor: -100
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["afocal", "perfect"])
 def test_no_focus_and_no_spot(kind, tmp_path, capsys, undrawn):
-    """An afocal lens has no focus, but a vergence: 1000 / 99.4975 mm here. A spot of rounding has
-    no size."""
+    """An afocal lens has no focus, but a vergence: 1000 / 99.4975 mm here. A spot that is only
+    rounding error has no size."""
     (tmp_path / "mine.yaml").write_text(AFOCAL if kind == "afocal" else PARABOLA)
     words = ["show", str(tmp_path / "mine.yaml"), "--field", "0", "--wavelengths", "0.55"]
     main([*words, "--out", str(tmp_path / "lens.png")])
@@ -126,7 +126,7 @@ def test_no_focus_and_no_spot(kind, tmp_path, capsys, undrawn):
 
 @pytest.mark.slow
 def test_words_for_apertures_and_focal_length(tmp_path, capsys, undrawn):
-    """A diameter for a semi-diameter; an aperture that cuts; a wrong sign."""
+    """A diameter given as semi-diameter; an aperture that vignettes; a wrong sign."""
     lens = """
     focal_length: 100
     surfaces:
@@ -148,7 +148,8 @@ def test_words_for_apertures_and_focal_length(tmp_path, capsys, undrawn):
 
 
 def test_lens_files_are_converted(tmp_path, capsys):
-    """Any format to any; a solve, a part that is left out and what is not written are told."""
+    """From any format to any; a solve, a part that is left out, and data that are not written are
+    reported."""
     lines = (
         "RDM; LEN; EPD 9; WL 550\nSO 0 1e11; S 50 4 NBK7; STO; CIR 6; S -50 48; PIM\nTEM 90\nSI; GO"
     )
@@ -169,7 +170,8 @@ def test_lens_files_are_converted(tmp_path, capsys):
 
 
 def test_a_lens_file_is_shown_as_it_is_used(tmp_path):
-    """Its fields, distance and wavelengths, the primary one in the middle; options come first."""
+    """With its fields, distance and wavelengths, the primary one in the middle; options take
+    precedence."""
     path = tmp_path / "a.zmx"
     save_lens(load_lens("singlet"), path)
     used = path.read_text().replace("WAVM 1 0.5875618 1\n", "").replace("DISZ INFINITY", "DISZ 500")
@@ -235,7 +237,7 @@ def test_errors_are_one_line(words, message, tmp_path, capsys):
 
 
 def test_a_reader_that_has_enough_is_no_error():
-    """As `head`: nothing is said of a pipe that is closed."""
+    """As with `head`: there is no message about a closed pipe."""
     words = [sys.executable, "-m", "drt_jax", "glass", "SF53"]
     with subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as run:
         run.stdout.close()
@@ -244,7 +246,7 @@ def test_a_reader_that_has_enough_is_no_error():
 
 
 def test_a_glass_shows_itself(tmp_path, capsys):
-    """N-BK7 of Schott's sheet: nd 1.51680, vd 64.17, P_gF 0.5349, 0.0009 below the normal line."""
+    """N-BK7 by Schott's sheet: nd 1.51680, vd 64.17, P_gF 0.5349, 0.0009 below the normal line."""
     picture = tmp_path / "map.png"
     main(["glass", "N-BK7", "--plot", str(picture)])
     said = capsys.readouterr().out

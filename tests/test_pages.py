@@ -1,4 +1,4 @@
-"""The code of each page of `docs/` runs, in a fresh process as a notebook of one page."""
+"""The code of each page of `docs/` runs, each page in a fresh process as one notebook."""
 
 import importlib.util
 import os
@@ -10,7 +10,8 @@ import sys
 import pytest
 
 DOCS = pathlib.Path(__file__).resolve().parent.parent / "docs"
-# What the package and its tests do not install: blocks that begin with it are left out without it.
+# Packages that the package and its tests do not install: without them, blocks that start with them
+# are left out.
 EXTRA = ("flax",)
 
 
@@ -25,12 +26,12 @@ CODE = {page.name: blocks(page) for page in sorted(DOCS.glob("*.md"))}
 X64 = 'jax.config.update("jax_enable_x64", True)'
 
 
-# Pages that trace thousands of lenses: faster machine code pays.
+# Pages that trace thousands of lenses, for which faster machine code saves time.
 MANY = ("tolerances.md",)
 
 
 def said_by(folder, page, code, *warnings):
-    """What a fresh process writes to stderr that ends with an error; None if it ends well."""
+    """The text on stderr of a fresh process that ends with an error; None if it succeeds."""
     given = os.environ["XLA_FLAGS"]
     given = given.replace("level=0", "level=1") if page in MANY else given
     flags = {"XLA_FLAGS": given, "JAX_PLATFORMS": "cpu"}
@@ -54,7 +55,7 @@ def test_code_runs(tmp_path, page):
 def test_your_own_loop_runs_in_float32(tmp_path):
     code = "\n".join(CODE["your_own_loop.md"])
     assert code.count(X64) == 1
-    # The library says what float32 cannot do, which is no more than the page does.
+    # The library warns of the limits of float32, which the page also mentions.
     code = code.replace(X64, "")
     assert said_by(tmp_path, "your_own_loop.md", code, "-W", "ignore:in float32") is None
 

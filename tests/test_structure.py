@@ -1,4 +1,5 @@
-"""The house: data flows one way, each outside package has its place, nothing grows too large."""
+"""Structure of the package: imports go one way, each external package has its place, no file and no
+room is too large."""
 
 import ast
 import graphlib
@@ -14,7 +15,8 @@ import drt_jax
 
 PACKAGE = pathlib.Path(drt_jax.__file__).parent
 ROOT = PACKAGE.parent
-# From what knows least to what knows most; a floor is a folder or a module beside the folders.
+# Floors in order: each imports only from those above it. A floor is a folder, or a module next to
+# the folders.
 FLOORS = (
     "inputs",
     "numerics",
@@ -32,8 +34,8 @@ FLOORS = (
     "check",
     "__main__",
 )
-# Floors that know no ray, and but for `files` no optics formula: all that they may import of the
-# package.
+# Floors without rays and, except `files`, without formulas of optics: all that they may import of
+# the package.
 ALLOWED = {
     "learn": {"inputs", "numerics", "compilation", "devices"}
     | {f"image.{name}" for name in ("kernel", "sensor", "spot", "wiener")},
@@ -67,7 +69,7 @@ ROOMS = {
     "experiments/trust": 1964,
 }
 PUBLIC = 60
-# Outside packages that belong to some modules or floors alone.
+# External packages that only some modules or floors may import.
 ONLY = {
     "optimistix": {"rays.aim", "rays.find", "image.field"},
     "matplotlib": {"show"},
@@ -78,7 +80,7 @@ ONLY = {
     "experiments": set(),
     "tests": set(),
 }
-# Where a package is installed by another name.
+# Packages that are installed under another name.
 NAMED = {"skimage": "scikit-image", "PIL": "pillow", "yaml": "pyyaml"}
 MODULES = {
     ".".join(path.relative_to(PACKAGE).with_suffix("").parts): path
@@ -132,7 +134,7 @@ def test_no_module_imports_itself_by_a_detour():
 @pytest.mark.parametrize("name", [name for name in MODULES if name != "__main__"])
 def test_the_library_is_silent_and_changes_no_global_setting(name):
     tree = ast.parse(MODULES[name].read_text())
-    # What a user asks for by name.
+    # Modules that a user imports by name.
     tree.body = [n for n in tree.body if getattr(n, "name", "") != "keep_programs"]
     calls = [node.func for node in ast.walk(tree) if type(node) is ast.Call]
     for call in map(ast.unparse, calls):
@@ -140,7 +142,8 @@ def test_the_library_is_silent_and_changes_no_global_setting(name):
 
 
 def test_what_is_imported_is_declared():
-    """The packages of pyproject.toml are those that the package imports, and one of experiments."""
+    """The packages of pyproject.toml are those that the package imports, and one for
+    experiments."""
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     declared = {re.split("[<>=]", line)[0] for line in project["dependencies"]}
     outside = set().union(*(imports(path)[1] for path in MODULES.values()))
@@ -157,7 +160,8 @@ def test_importing_the_package_draws_nothing_in():
 
 
 def code(path):
-    """Numbers of the lines of a file that are code: no blank, comment, docstring or import."""
+    """Numbers of the lines of a file that are code: without blank lines, comments, docstrings and
+    imports."""
     text = path.read_text()
     free = {k for k, line in enumerate(text.splitlines(), 1) if not line.split("#")[0].strip()}
     for node in ast.walk(ast.parse(text)):

@@ -23,7 +23,7 @@ COLUMNS = ("tests", "cpu", "trace", "lower", "compile", "programs", "loaded")
 
 
 class Times:
-    """Pytest plugin that adds up the times of a run; each test carries its own to the process that
+    """Pytest plugin that adds up the times of a run; each test sends its times to the process that
     reports."""
 
     def __init__(self, file: str):
@@ -34,7 +34,8 @@ class Times:
         jax.monitoring.register_event_duration_secs_listener(self._heard)
 
     def _heard(self, event: str, seconds: float, **_: Any) -> None:
-        """Counts an event that ends now, less those within it: tracing a program traces others."""
+        """Counts an event that ends now, without the events inside it: tracing a program traces
+        others."""
         if name := _EVENTS.get(event):
             start, within = time.perf_counter() - seconds, 0.0
             while self.ended and self.ended[-1][0] > start:

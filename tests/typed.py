@@ -1,5 +1,5 @@
-"""Calls as pages show them, for mypy: `make check` reads this file, nothing runs it. A line with
-`type: ignore` holds what must be refused; where it no longer is, mypy says so."""
+"""Calls as shown on pages, for mypy: `make check` reads this file, nothing runs it. A line with
+`type: ignore` has a call that mypy must reject; if it no longer does, mypy reports it."""
 
 import jax.numpy as jnp
 from jax import Array

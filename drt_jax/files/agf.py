@@ -18,7 +18,7 @@ def _sellmeier(terms: int) -> Callable[[list[float]], _Forms]:
 
 
 def _powers(*order: int) -> Callable[[list[float]], _Forms]:
-    """The formula whose coefficient k stands at place `order[k]` of `Glass.schott`."""
+    """The formula whose coefficient k is entry `order[k]` of `Glass.schott`."""
 
     def formula(c: list[float]) -> _Forms:
         placed = dict(zip(order, c, strict=False))
@@ -62,17 +62,18 @@ _FORMULAS: dict[int, tuple[Callable[[list[float]], _Forms], int]] = {
 def load_agf(
     path: str | os.PathLike, names: Collection[str] | None = None, missing: Missing = "error"
 ) -> dict[str, Glass]:
-    """Read the glasses of a `.agf` file by name: at the file's temperatures, relative to air.
+    """Read the glasses of a `.agf` file by name: indices at the file's temperatures, relative to
+    air, status, thermal constants and expansion.
 
-    With status, thermal constants and expansion; Zemax writes zeros for what is not known, and so
-    glasses without a thermal constant, or without expansion, have none.
+    Zemax writes zeros for unknown values. A glass whose thermal constants or whose expansion are
+    all zero therefore has none.
 
-    LensError, with the line, if this is no such file, or if a glass has another formula than
-    Zemax's 1, 2, 4 and 6 to 13, or has no index above 1 somewhere within its range.
+    LensError, with the line, if the file is not a `.agf` file, if the formula of a glass is not 1,
+    2, 4 or 6 to 13 of Zemax, or if the index of a glass is not above 1 everywhere in its range.
 
     path: a file of at most 16 MB.
     names: the glasses to read; None reads all.
-    missing: "warn" leaves out such glasses and names them in one warning.
+    missing: "warn" leaves out glasses that cannot be read, and names them in one warning.
     """
     record, blocks = Record(str(path), missing), list[dict[str, Words]]()
     with naming(path):
@@ -96,7 +97,10 @@ def load_agf(
 
 
 def _glass(record: Record, block: dict[str, Words]) -> Glass | None:
-    """The glass of the lines of a block by their keys; None for one that is left out."""
+    """The glass of a block of lines.
+
+    block: the line of each key. None for a glass that is left out.
+    """
     head, name = block["NM"], block["NM"].values[0]
     formula, called = head.count(1), short(name)
     if formula not in _FORMULAS:

@@ -1,4 +1,4 @@
-"""What clips rays at the surfaces of a prescription: semi-diameters, apertures, obscurations."""
+"""Semi-diameters, apertures and obscurations of the surfaces of a prescription."""
 
 import math
 from typing import NamedTuple
@@ -11,8 +11,8 @@ from ..lens.polygon import CORNERS, convex_pieces, tidied
 from .entry import Entry, array
 
 KINDS = ("circle", "ellipse", "rectangle", "polygon")
-_MOST = 6  # obscurations per lens: n of them need 2^n times as many rays
-_TERMS = 64  # and with polygons of several convex pieces: as many times as many rays
+_MOST = 6  # obscurations per lens: n of them multiply the number of rays by 2^n
+_TERMS = 64  # largest such factor, with polygons of several convex pieces
 _MANY = 20  # apertures per surface
 
 
@@ -39,7 +39,7 @@ class _Aperture(NamedTuple):
 
 
 def _read(surface: Entry, key: str) -> list[_Aperture]:
-    """The shapes under `aperture` or `obscuration`: the key holds one mapping or a list of them."""
+    """The shapes of the key `aperture` or `obscuration`, which holds one mapping or a list."""
     given = surface.get(key, [])
     many = isinstance(given, list)
     if many:
@@ -80,8 +80,9 @@ def _check_reach(surface: Entry, entry: Entry, key: str, reach: float) -> None:
 
 
 def semi_diameter(surface: Entry) -> float:
-    """The clear semi-diameter about the vertex, mm, within the extent of the surface. The stop's is
-    finite: if it is not given, it is the circle around the stop's smallest aperture."""
+    """The clear semi-diameter about the vertex, mm, within the domain of the sag. That of the stop
+    is finite: if it is not given, it is the radius of a circle around the smallest aperture of the
+    stop."""
     semi = surface.positive("semi_diameter", math.inf, finite=False)
     if math.isinf(semi) and surface.flag("stop"):
         semi = min((own.reach for own in _read(surface, "aperture")), default=math.inf)
@@ -92,7 +93,11 @@ def semi_diameter(surface: Entry) -> float:
 
 
 def apertures_of(surfaces: list[Entry]) -> Apertures | None:
-    """All apertures and obscurations of the surfaces; None if there are none."""
+    """All apertures and obscurations of the surfaces; None if there are none.
+
+    Obscurations and polygons of several convex pieces make the open area a sum of terms, see
+    `Apertures.terms`. Each term is traced with its own rays, so that their number is limited.
+    """
     found = [
         (i, key == "obscuration", own)
         for i, surface in enumerate(surfaces)

@@ -24,7 +24,7 @@ _SHORT_CODE = re.compile(r"\d{6}")
 _PAIR = re.compile(r"(\d\.\d{1,17}):(\d{2,3}(?:\.\d{1,17})?)")
 _NIKON = {"NIKON": "HIKARI"}
 _POWERS = np.array([0.0, -1.0, -3.5])
-_ROUNDING = 1e-12  # a P_gF that is as near to the normal line lies on it
+_ROUNDING = 1e-12  # a P_gF that differs by less from the normal line lies on it
 _M1 = np.array([-7.12849, 4.95284, -0.202244])
 _M2 = np.array([8.84931, -6.91677, 0.454415])
 
@@ -59,9 +59,15 @@ def in_catalogues(name: str, catalogues: Sequence[str]) -> Glass | None:
 def named_glass(
     row: Row, line: int, name: str, makers: Sequence[str], beside: Mapping[str, Any] = _PLAIN["AIR"]
 ) -> dict[str, Any]:
-    """The prescription entries of a glass, found by name in the catalogues of these makers, or of
-    all makers if `makers` is empty. If no catalogue knows the name: `beside`, the keys that the
-    file gives beside it, with a note; LensError without any, or if other makers alone have it."""
+    """The prescription entries of a glass, which is looked up by name.
+
+    makers: makers whose catalogues are searched; empty for all.
+    beside: keys that the file gives together with the name. They are used, with a note, if no
+        catalogue has the name.
+
+    LensError if no catalogue has the name and `beside` is empty, or if only catalogues of other
+    makers have it.
+    """
     if name.upper() in _PLAIN:
         return _PLAIN[name.upper()]
     own = _SAME.get(name.upper(), name)
@@ -71,7 +77,7 @@ def named_glass(
     except ValueError as error:
         if not found and beside and not spellings(own):
             numbers = " ".join(f"{key} {value:.7g}" for key, value in beside.items())
-            what = f"{row.name}: no catalogue has {short(name)}: {numbers}, as beside it"
+            what = f"{row.name}: no catalogue has {short(name)}: {numbers}, as in its line"
             row.record.note(line, what)
             return dict(beside)
         what = f"{error}; give nd and vd as a model glass in the file"
@@ -87,8 +93,9 @@ def named_glass(
 
 
 def written_names(names: Sequence[str]) -> tuple[list[str], dict[str, str]]:
-    """Catalogues that hold all these glasses, and the name of each glass there. If an earlier
-    catalogue has another glass of this name, it is NAME_MAKER, which other programs do not know."""
+    """Catalogues that have all these glasses, and the name of each glass in them. If an earlier
+    catalogue has another glass of the same name, the name becomes NAME_MAKER, which other programs
+    do not know."""
     glasses = {name: find_glass(name) for name in names}
     makers = {glass.maker for glass in glasses.values()} - {"", "SCHOTT"}
     order, written = [*sorted(makers), "SCHOTT"], {}
@@ -126,8 +133,8 @@ def to_theirs(nd: float, vd: float, above: float) -> tuple[float, float, float]:
 
 
 def model_keys(row: Row, line: int, nd: float, vd: float, above: float) -> dict[str, Any]:
-    """The keys of a medium of nd, vd and dP in a file; vd 0 is a constant index. LensError for
-    numbers that no glass has."""
+    """The prescription keys of a medium with nd, vd and dP of a file; vd = 0 means a constant
+    index. LensError for values that no glass has."""
     if not vd:
         return {"index": nd}
     require_glass(row, line, nd, vd)
@@ -135,5 +142,5 @@ def model_keys(row: Row, line: int, nd: float, vd: float, above: float) -> dict[
 
 
 def require_glass(row: Row, line: int, nd: float, vd: float) -> None:
-    """LensError for nd and vd that no glass has."""
+    """LensError if no glass has this nd and vd."""
     row.require(1 < nd <= 4 and 10 <= vd <= 120, f"no glass has nd {nd:g} and vd {vd:g}", line)

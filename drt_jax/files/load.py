@@ -31,9 +31,9 @@ _SAME = 1e-9  # relative tolerance of a stop size that a file gives twice
 
 @dataclasses.dataclass(frozen=True)
 class System:
-    """A lens and how a file uses it.
+    """A lens with the fields, wavelengths and aperture of its file.
 
-    lens: the lens; its stop is as wide as the aperture of the file requires.
+    lens: the lens; the size of its stop follows from the aperture of the file.
     distance: from the object to the first vertex, mm; may be inf.
     fields: (F, 2), radians along x and y, see `Scene`; None if the file gives real image heights,
         for which `field_of_image(lens, height, ...)` finds the fields.
@@ -44,12 +44,12 @@ class System:
         as fractions of its radius, and its rotation in radians: x' = shift + (1 - compression) x.
     wavelengths: (W,), um. wavelength_weights: (W,). primary: the index of the primary wavelength.
     aperture: the file's value for `aperture_kind`; None if the aperture is the size of the stop.
-    ray_aiming: point at which the other program aims rays. `off`: the paraxial entrance pupil, see
+    ray_aiming: where the other program aims rays. `off`: at the paraxial entrance pupil, see
         `with_paraxial_pupil`. `chief` (CODE V): the chief ray at the centre of the stop, the others
         around it over an entrance pupil of paraxial width. Otherwise at the stop, as here.
-    notes: features of the file that the lens lacks or that are read differently.
-    configurations: number of configurations (zoom positions) of the file. configuration: the one
-        that was read, from 1.
+    notes: features of the file that are missing in the lens or are read differently.
+    configurations: number of configurations (zoom positions) of the file.
+    configuration: number of the one that was read, from 1.
     """
 
     lens: Lens
@@ -73,8 +73,8 @@ class System:
     def of(cls, lens: Lens, scene: Scene) -> "System":
         """A lens with the fields, distance, wavelengths and weights of a scene, for `save_lens`.
 
-        In a file, the fields are angles, seen from the entrance pupil as in other programs; heights
-        of the object for a telecentric lens. The primary wavelength is that in the middle.
+        The fields are written as angles, measured at the entrance pupil as in other programs, or as
+        object heights for a telecentric lens. The primary wavelength is the middle one.
 
         ValueError unless the scene has one distance.
         """
@@ -131,7 +131,7 @@ def system_for(lens: Lens) -> System:
 
 
 def _of_system(use: Use) -> dict[str, Any]:
-    """The fields of `System` that need no ray."""
+    """The fields of `System` that follow from the file without a ray trace."""
     names = {field.name for field in dataclasses.fields(System)}
     own = {key: value for key, value in vars(use).items() if key in names}
     return {key: np.array(v, float) if isinstance(v, list) else v for key, v in own.items()}
@@ -179,7 +179,7 @@ def load_lens(
 
 
 def known_ending(path: str | pathlib.Path) -> str:
-    """The ending of a path, in small letters. LensError for one of no kind of file here."""
+    """The ending of a path in lower case. LensError if it is not one that is read and written."""
     kind = pathlib.Path(path).suffix.lower()
     require(kind in _ENDINGS, f"{path}: expected a name that ends in {', '.join(_ENDINGS)}")
     return kind
@@ -188,8 +188,8 @@ def known_ending(path: str | pathlib.Path) -> str:
 def lens_in(
     text: str, path: str | pathlib.Path, configuration: int | None = None
 ) -> tuple[Lens, dict[str, Any]]:
-    """The lens of the text of a file, and of its use the fields of `System` that need no ray; none
-    of a prescription. LensError as of `load_lens`. path: its name."""
+    """The lens in the text of a file, and the fields of `System` that need no ray trace (empty for
+    a prescription). LensError as in `load_lens`. path: name of the file."""
     kind = known_ending(path)
     if kind not in _READERS:
         return _lens_of_yaml(text, pathlib.Path(path)), {}
@@ -198,7 +198,7 @@ def lens_in(
 
 
 def _lens_of_yaml(text: str, path: pathlib.Path) -> Lens:
-    """The lens of a prescription. InputError for what is no YAML."""
+    """The lens of a prescription. InputError if the text is not YAML."""
     values, lines = parse(text)
     try:
         return build_lens(_with_catalogues(values, path.parent), path.stem)
@@ -207,8 +207,11 @@ def _lens_of_yaml(text: str, path: pathlib.Path) -> Lens:
 
 
 def _with_catalogues(top: Any, folder: pathlib.Path) -> Any:
-    """Add to `glasses` of a prescription the glasses that it uses from its `catalogues`. They take
-    precedence over the built-in table, and the prescription's own glasses over them."""
+    """Add the glasses that a prescription uses from its `catalogues` to its `glasses`.
+
+    The glasses of the prescription take precedence over those of its catalogues, and these over the
+    built-in table.
+    """
     if not isinstance(top, dict) or "catalogues" not in top:
         return top
     paths, surfaces = top["catalogues"], top.get("surfaces")
@@ -236,15 +239,15 @@ def load_system(
     """Read a lens with its fields, wavelengths and aperture from a Zemax `.zmx` or CODE V
     `.seq` file of at most 16 MB; see docs/lens_files.md.
 
-    One warning and `System.notes` list what is read differently from the file, such as solves,
-    which are read as the values beside them. LensError, in one line with the line of the file, for
-    a feature that is not read.
+    One warning and `System.notes` list what is read differently from the file. A solve, for
+    instance, is read as its present value. LensError, with the line of the file, for a feature that
+    is not supported.
 
-    missing: "error" refuses features that the package lacks; "warn" leaves them out, and lists
-        them, if rays can be traced without them.
-    configuration: number of a configuration or zoom position, as in the file from 1; None for the
-        current one of a `.zmx` file, the first of a `.seq` file. `System.configurations` says how
-        many there are.
+    missing: "error" raises LensError for unsupported features; "warn" leaves out those without
+        which rays can be traced, and lists them.
+    configuration: number of a configuration or zoom position, from 1 as in the file; None for the
+        current one of a `.zmx` file, the first of a `.seq` file. `System.configurations` is their
+        number.
     """
     known = pathlib.Path(path).suffix.lower() in _READERS
     what = f"{path}: fields and wavelengths are read from {', '.join(_READERS)}; use load_lens"
@@ -269,7 +272,7 @@ def read_record(
 
 
 def _lens_of(record: Record) -> Lens:
-    """The lens of a file, with its stop as wide as the aperture requires."""
+    """The lens of a file; the size of its stop follows from the aperture."""
     use = record.use
     many, direct = len(use.wavelengths), use.aperture_kind is None
     record.require(many, 0, "no wavelength is given")
@@ -302,7 +305,7 @@ def _first(record: Record, lens: Lens) -> tuple[FirstOrder, float, list[float]]:
 
 
 def _opened(record: Record, lens: Lens) -> Lens:
-    """The lens with its stop as wide as the aperture requires in paraxial optics.
+    """The lens with the size of its stop set, by paraxial optics, to the aperture of the file.
 
     Each kind of aperture gives the radius `wide` of the entrance pupil, mm. The stop is scaled by
     the ratio of this radius to that of the present entrance pupil.
@@ -342,8 +345,8 @@ def _opened(record: Record, lens: Lens) -> Lens:
 
 
 def _without_rim(lens: Lens) -> Lens:
-    """The lens without the first clear circle about the vertex of its stop. The stop has the same
-    size, and clipping twice would lose rays by rounding."""
+    """The lens without the first clear circle about the vertex of its stop. The stop itself has
+    the same size, and clipping at both would lose rays by rounding."""
     own = lens.apertures
     if own is None:
         return lens

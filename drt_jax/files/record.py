@@ -1,4 +1,4 @@
-"""Files of other programs: their text, its words, and the prescription that is read from them."""
+"""Files of other programs: their lines and words, and the prescription built from them."""
 
 import codecs
 import contextlib
@@ -35,8 +35,11 @@ _MARKS = {codecs.BOM_UTF8: "utf-8-sig", codecs.BOM_LE: "utf-16", codecs.BOM_BE: 
 
 @dataclasses.dataclass
 class Breaking:
-    """A coordinate break: shift in mm, tilt in degrees about x, the turned y and the turned z, and
-    thickness, the distance to the next surface or break, mm."""
+    """A coordinate break.
+
+    shift: decentre, mm. tilt: degrees about x, the rotated y and the rotated z.
+    thickness: distance to the next surface or break, mm.
+    """
 
     line: int
     shift: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -46,9 +49,11 @@ class Breaking:
 
 @dataclasses.dataclass
 class Use:
-    """How a file uses its lens: the values for `System`, by the same names. stop: its size, mm,
-    where the file gives that. line, field_line, primary_line: of the aperture, the fields and the
-    wavelengths."""
+    """Fields, wavelengths and aperture of a file, with the names of `System`.
+
+    stop: size of the stop, mm, if the file gives it.
+    line, field_line, primary_line: lines of the aperture, the fields and the wavelengths.
+    """
 
     aperture: float | None = None
     aperture_kind: ApertureKind | None = None
@@ -68,15 +73,19 @@ class Use:
 
 @dataclasses.dataclass
 class Record:
-    """A file as it is read. Lengths in mm.
+    """What has been read from a file so far. Lengths in mm.
 
-    path, missing: see `load_lens`. name: of the lens. use: fields, wavelengths and aperture.
-    distance: of the object, below 0 for a virtual one behind the first vertex. medium: keys of the
-    object's medium. parts: surfaces and coordinate breaks in order; the image is the last surface.
-    glasses: those that the file itself defines, as in a prescription. afocal: as in `Lens`.
-    configurations: their number. configuration: the one that is read, from 1.
-    notes: what is left out or read differently from the file. solves: lines with solves. unknown:
-    words that are not known, each with its line.
+    path, missing: see `load_lens`.
+    name: of the lens.
+    use: fields, wavelengths and aperture.
+    distance: of the object; below 0 for a virtual object behind the first vertex.
+    medium: keys of the medium of object space.
+    parts: surfaces and coordinate breaks in order; the image is the last surface.
+    glasses: glasses that the file defines, as in a prescription.
+    afocal: as in `Lens`.
+    configurations: number of configurations. configuration: the one that is read, from 1.
+    notes: what is left out or read differently from the file.
+    solves: lines with solves. unknown: unknown words, each with its line.
     """
 
     path: str
@@ -99,12 +108,12 @@ class Record:
         return LensError(f"{self.path}{f', line {line}' if line else ''}: {message}")
 
     def require(self, condition: object, line: int, message: str) -> None:
-        """The error unless the condition holds."""
+        """Raise `error` unless the condition holds."""
         if not condition:
             raise self.error(line, message)
 
     def lacks(self, line: int, message: str) -> None:
-        """LensError for a feature that the package lacks, or a note if it may be left out."""
+        """LensError for an unsupported feature, or a note if it may be left out."""
         if self.missing == "error":
             raise self.error(line, f'{message}; missing="warn" leaves it out')
         self.note(line, f"left out: {message}")
@@ -114,7 +123,7 @@ class Record:
         self.notes.append(f"line {line}: {message}")
 
     def choose(self, line: int, count: int, current: int, wanted: int | None) -> None:
-        """Set the configuration that is read: the wanted one, or the current one with a note.
+        """Set the configuration that is read: `wanted` or, if that is None, `current` with a note.
         LensError for a number that does not exist."""
         self.configurations, self.configuration = count, current if wanted is None else wanted
         some = f"the file has {count}, from 1" if count > 1 else "the file has one alone"
@@ -124,11 +133,11 @@ class Record:
             self.note(line, f"of {count} configurations number {current}; give `configuration`")
 
     def note_unread(self, what: str) -> None:
-        """Notes of solves, and of words that are not known. what: kind of the words."""
+        """Add notes of solves and of unknown words. what: kind of the words."""
         if self.solves:
             some = _listed(map(str, self.solves), 5)
             place = f"line{'s' * (len(self.solves) > 1)} {some}"
-            self.notes.append(f"{place}: solves and pickups are read as the values beside them")
+            self.notes.append(f"{place}: solves and pickups are read as their present values")
         if self.unknown:
             some = _listed([f"{key} (line {line})" for key, line in self.unknown.items()], 8)
             self.notes.append(f"{what} that are not known: {some}")
@@ -182,8 +191,14 @@ class Record:
             self.notes.append(f"surfaces that touch stand {CLOSEST:g} mm apart: {some}")
 
     def _prescription(self, semi_diameter: float) -> tuple[dict[str, Any], Lines, list[str]]:
-        """Surfaces and elements for `build_lens`, the line of each key, the name of each
-        surface. The object's distance counts from the first of them on."""
+        """Surfaces and elements for `build_lens`, the line of each key, and the name of each
+        surface. The distance of the object is measured from the first surface.
+
+        A coordinate break becomes an element from the next surface to the sensor. Its pivot lies on
+        the axis in front of this surface, at the position of the break. The thickness of the break
+        is added to that of the surface before it. Planes in air without an effect in front of the
+        first surface are left out.
+        """
         surfaces: list[dict[str, Any]] = []
         elements: list[dict[str, Any]] = []
         lines, names, waiting = Lines(), list[str](), list[Breaking]()
@@ -219,9 +234,13 @@ class Record:
 
 @dataclasses.dataclass
 class Row:
-    """A surface of a file. name: in messages. unit: of length in the file, mm. kind: its type.
-    values: its parameters by number or key as in the file, each with its line. entry: as in a
-    prescription, in mm. lines: of its keys. thickness: mm."""
+    """A surface of a file.
+
+    name: its name in messages. unit: unit of length of the file, mm. kind: its type.
+    values: (line, value) of each parameter, by number or key as in the file.
+    entry: its entry in a prescription, in mm. lines: the line of each key of `entry`.
+    thickness: mm.
+    """
 
     record: Record
     name: str
@@ -235,13 +254,13 @@ class Row:
     thickness: float = 0.0
 
     def require(self, condition: object, message: str, line: int = 0) -> None:
-        """LensError about the surface unless the condition holds. line: that of the error, 0 for
-        the first of the surface."""
+        """LensError about the surface unless the condition holds. line: line for the message, 0
+        for the first line of the surface."""
         if not condition:
             raise self.record.error(line or self.line, f"{self.name}: {message}")
 
     def put(self, key: str, value: object, line: int = 0) -> None:
-        """Set an entry and its line, 0 for that of the surface."""
+        """Set a key of the entry. line: its line in the file, 0 for that of the surface."""
         self.entry[key] = value
         self.lines[key] = line or self.line
 
@@ -254,7 +273,7 @@ class Row:
         return {p: a for key, p in keys.items() if (a := self.value(key) * self.unit ** (1 - p))}
 
     def shape(self, form: str, terms: Mapping[Any, float], **more: object) -> None:
-        """Set the form, its coefficients, if there are any, and keys of its own, `more`."""
+        """Set the form, its coefficients if there are any, and its other keys, `more`."""
         own = {"form": form} if form != "asphere" else {}
         for key, value in (own | ({"coefficients": terms} if terms else {}) | more).items():
             self.put(key, value, self.kind_line)
@@ -264,9 +283,12 @@ class Row:
         self.put(key, [*self.entry.get(key, []), shape], line)
 
     def put_clear(self, shape: Mapping[str, Any], line: int, named: bool = False) -> bool:
-        """Add a clear aperture; False for a circle beyond the end of the surface, which clips
-        nothing. The first circle about the vertex is the semi-diameter, but at the stop, whose size
-        is that of the file's aperture, or if it is `named`."""
+        """Add a clear aperture. Return False for a circle beyond the domain of the sag, which clips
+        nothing.
+
+        The first circle about the vertex becomes the semi-diameter, except at the stop, whose size
+        follows from the aperture of the file, and except for a circle that is `named`.
+        """
         entry, radius = self.entry, 0.0 if "centre" in shape else shape.get("circle", 0.0)
         rim = (entry.get("conic", 0.0) + 1) * (entry["curvature"] * radius) ** 2
         if entry.get("form") is None and rim >= 1:
@@ -285,8 +307,11 @@ class Row:
 
 @dataclasses.dataclass
 class Words:
-    """A line of a file, or a command. line: its number from 1. key: its first word. values: the
-    others. indented: whether the line is."""
+    """A line of a file, or a command.
+
+    line: its number from 1. key: its first word. values: its other words.
+    indented: whether the line is indented.
+    """
 
     record: Record
     line: int
@@ -312,7 +337,7 @@ class Words:
         return value
 
     def numbers(self, first: int, end: int) -> list[float]:
-        """The values from number `first` to before `end`."""
+        """`values[first:end]` as numbers."""
         return [self.number(at) for at in range(first, end)]
 
     def bounded(self, at: int = 0) -> float:
@@ -341,8 +366,9 @@ def naming(path: str | os.PathLike) -> Iterator[None]:
 
 
 def lines_of(path: str | os.PathLike) -> list[str]:
-    """The lines of a file of at most 16 MB: its byte order mark or UTF-16's zero bytes decide, else
-    UTF-8, else Latin-1. InputError, with the byte or character, if it is no text."""
+    """The lines of a file of at most 16 MB. A byte order mark or the zero bytes of UTF-16 decide
+    the encoding; otherwise it is UTF-8 if the file is valid UTF-8, else Latin-1. InputError, with
+    the byte or character, if the file is not text."""
     content = read_bytes(path, _FILE, "lens file")
     known = next((name for mark, name in _MARKS.items() if content.startswith(mark)), "")
     head = content[:1000]
@@ -366,7 +392,7 @@ def lines_of(path: str | os.PathLike) -> list[str]:
 
 
 def words_of(record: Record, lines: list[str]) -> list[Words]:
-    """The lines of a file split into words, without empty lines; long notes are cut."""
+    """The lines of a file split into words, without empty lines; long notes are truncated."""
     found = []
     for i, text in enumerate(lines, 1):
         if len(text) > LONGEST and re.match(r"\s*[A-Z]{4}\s+[-+.\d]", text):
@@ -385,12 +411,12 @@ def _listed(words: Iterable[str], most: int) -> str:
 
 
 def distance_of(value: float) -> float:
-    """A distance of a file, mm; inf from 1e10 mm on, in front of the lens or behind it."""
+    """A distance of a file, mm; inf if its magnitude is 1e10 mm or more."""
     return math.inf if abs(value) >= _FAR else value
 
 
 def rotation_of(tilt: tuple[float, float, float]) -> np.ndarray:
-    """The rotation matrix (3, 3) of tilts in degrees about x, the turned y and the turned z."""
+    """The rotation matrix (3, 3) of tilts in degrees about x, the rotated y and the rotated z."""
     x, y, z = _turns(tilt)
     return x @ y @ z
 
@@ -404,7 +430,7 @@ def _turns(tilt: tuple[float, float, float]) -> tuple[np.ndarray, np.ndarray, np
 
 
 def turns_of(turn: np.ndarray) -> tuple[float, float, float]:
-    """Tilts in degrees about x, the turned y and the turned z of a rotation matrix (3, 3)."""
+    """Tilts in degrees about x, the rotated y and the rotated z of a rotation matrix (3, 3)."""
     return (
         math.degrees(math.atan2(-turn[1, 2], turn[2, 2])),
         math.degrees(math.asin(max(-1.0, min(1.0, turn[0, 2])))),
@@ -413,8 +439,8 @@ def turns_of(turn: np.ndarray) -> tuple[float, float, float]:
 
 
 def turned_back(tilt: tuple[float, float, float]) -> tuple[np.ndarray, tuple[float, float, float]]:
-    """The rotation matrix (3, 3) of tilts in degrees about z, the turned y and the turned x, and
-    the same rotation as tilts about x, the turned y and the turned z."""
+    """The rotation matrix (3, 3) of tilts in degrees about z, the rotated y and the rotated x, and
+    the same rotation as tilts about x, the rotated y and the rotated z."""
     x, y, z = _turns(tilt)
     turn = z @ y @ x
     return turn, tilt if np.count_nonzero(tilt) <= 1 else turns_of(turn)

@@ -52,9 +52,13 @@ class _Reader:
     """The state of reading one file.
 
     lists, list_lines: numbers of fields and wavelengths by key, and the line of each key's last
-    command. unit: of length, mm. radii: whether numbers of surfaces are radii, None until RDM says.
-    complete: whether the image has come. stop: number of its surface, 0 until it is known. clips:
-    whether apertures are used. wanted: the zoom position to read, see `load_system`.
+        command.
+    unit: unit of length, mm.
+    radii: whether surfaces have radii (True) or curvatures; None before a command RDM.
+    complete: whether the image surface has been read.
+    stop: number of the stop surface, 0 until it is known.
+    clips: whether apertures are used.
+    wanted: the zoom position to read, see `load_system`.
     """
 
     def __init__(self, path: str, missing: Missing, wanted: int | None):
@@ -102,7 +106,7 @@ class _Reader:
 
 
 def _surface(reader: _Reader, command: Command) -> None:
-    """S, SO, SI or S with a number: begin a new surface, or change an existing one."""
+    """S, SO, SI or S with a number: start a new surface, or change an existing one."""
     name, due, words = command.key[1:], len(reader.surfaces), command.values
     before = not reader.complete or name == "I" or name.isdecimal()
     command.require(name != "S" and before, f"{command.key}: a surface behind the image")
@@ -138,7 +142,12 @@ def _zoom(reader: _Reader, command: Command) -> None:
 
 
 def _take(reader: _Reader, command: Command) -> None:
-    """Execute a command from outside the private catalogue."""
+    """Execute a command that is not in the private catalogue.
+
+    The order of the cases matters: a key may be a surface, a list of fields or wavelengths, a
+    command of the whole lens, a solve, or a command of one surface. Other keys are ignored, refused
+    or noted as unknown.
+    """
     if (zoom := command.of("Z")) and str(reader.record.configuration) not in zoom:
         return  # for another zoom position, see `_zoom`
     record, use, line = reader.record, reader.record.use, command.line
@@ -194,8 +203,9 @@ def _take(reader: _Reader, command: Command) -> None:
 def read_seq(
     path: str, missing: Missing, lines: list[str], configuration: int | None = None
 ) -> Record:
-    """Read the lines of a `.seq` file into a record of its surfaces and their use. LensError with
-    the line. path: its name in messages. configuration: see `load_system`."""
+    """Read the lines of a `.seq` file into a record of its surfaces, fields, wavelengths and
+    aperture. LensError with the line. path: its name in messages. configuration: see
+    `load_system`."""
     reader, private, ended = _Reader(path, missing, configuration), False, False
     for own in commands_of(reader.record, lines):
         if ended:
@@ -242,7 +252,11 @@ def _finish(reader: _Reader) -> None:
 
 
 def _use(reader: _Reader) -> None:
-    """Write fields and wavelengths as `System` holds them."""
+    """Write fields and wavelengths in the form of `System`.
+
+    A list that is missing, or shorter than the number of fields or wavelengths, is filled up with
+    its default value; a longer one raises LensError.
+    """
     record, lists, lines = reader.record, reader.lists, reader.list_lines
     use, waves = record.use, record.use.wavelengths
 
@@ -279,7 +293,7 @@ def _use(reader: _Reader) -> None:
 
 @dataclasses.dataclass
 class _Frames:
-    """The axis at each surface: its origin `point` (3,), mm, and its rotation `turn` (3, 3)."""
+    """The local axes at each surface: origin `point` (3,), mm, and rotation `turn` (3, 3)."""
 
     record: Record
     point: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(3))
@@ -287,12 +301,12 @@ class _Frames:
     before: list[tuple[np.ndarray, np.ndarray, bool]] = dataclasses.field(default_factory=list)
 
     def parts(self, surface: Surface, image: bool) -> list[Row | Breaking]:
-        """A surface with the breaks before and behind it; the last part takes its thickness.
+        """A surface with the breaks in front of it and behind it; the last part has its thickness.
 
-        A decentre and tilt is a break in front of the surface, which moves all that follows. With
-        DAR it moves the surface alone; with REV the inverse move stands behind the surface; with
-        BEN the tilt is repeated behind it, as at a folding mirror; RET returns to the axis of an
-        earlier surface.
+        A decentre and tilt becomes a break in front of the surface, which moves all that follows.
+        With DAR only the surface is moved. With REV the inverse break follows the surface. With BEN
+        the tilt is repeated behind the surface, as at a folding mirror. RET returns to the axis of
+        an earlier surface.
         """
         kind, line = surface.turn, surface.move_line
         x, y, z, a, b, c = (surface.moves.get(key, 0.0) for key in MOVES)

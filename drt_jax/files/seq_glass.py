@@ -23,8 +23,11 @@ def folded(name: str) -> str:
 
 
 class Glasses:
-    """The private catalogue of a file, and lookup of makers' glasses by name. tables: by name, the
-    command of a private glass and its wavelengths, um. used: glasses of the prescription."""
+    """The private catalogue of a file, and lookup of makers' glasses by name.
+
+    tables: by name, the command of a private glass and its wavelengths, um.
+    used: glasses of the prescription.
+    """
 
     def __init__(self, record: Record):
         self.record, self.waves = record, list[float]()
@@ -88,8 +91,11 @@ def _private(command: Command, waves: list[float]) -> dict[str, Any]:
 
 
 def _table(command: Command, waves: list[float]) -> dict[str, Any]:
-    """Schott's formula for a table. It passes through all of up to six indices; else through up
-    to five at the file's wavelengths, with a least-squares fit to those near them."""
+    """Schott's formula for a table of indices.
+
+    It passes through all indices of a table of up to six. For a longer table it passes through up
+    to five indices at the wavelengths of the file, and is a least-squares fit to those near them.
+    """
     name, count = short(command.key), len(command.values)
     system = command.record.use.wavelengths
     many = f"{count} indices for {len(waves)} wavelengths of PWL"
@@ -113,9 +119,11 @@ def _table(command: Command, waves: list[float]) -> dict[str, Any]:
 def schott_through(
     at: np.ndarray, indices: np.ndarray, held: list[int]
 ) -> tuple[list[float], float]:
-    """Schott's formula through indices: its six constants, and how far it is off at most.
+    """Schott's formula through indices: its six constants, and its largest error.
 
-    at: wavelengths, um. held: which of them it passes through; the others by least squares.
+    at: wavelengths, um. indices: the indices there.
+    held: the wavelengths at which the formula equals the index; the others are fitted by least
+        squares.
     """
     terms = len(at) if len(at) <= 6 else min(6, 4 + len(held))
     powers = np.power.outer(at, _POWERS[:terms]).astype(float)
@@ -127,7 +135,7 @@ def schott_through(
     if free.size:
         rest = wanted - rows @ solution
         solution = solution + free @ np.linalg.lstsq(rows @ free, rest)[0]
-    if held:  # what rounding has left
+    if held:  # correct the rounding error at the held wavelengths
         solution = solution + np.linalg.lstsq(rows[held], (wanted - rows @ solution)[held])[0]
     off = np.abs(np.sqrt(np.maximum(rows @ solution, 0)) - indices).max()
     known = dict(zip(_POWERS[:terms], (solution / scale).tolist(), strict=True))
@@ -135,8 +143,8 @@ def schott_through(
 
 
 def _near(table: list[tuple[float, float]], system: list[float]) -> list[tuple[float, float]]:
-    """The rows of a table between the file's wavelengths, extended on both sides until there are at
-    least eight."""
+    """The rows of a table between the wavelengths of the file, extended on both sides to at least
+    eight rows."""
     inside = [k for k, (wave, _) in enumerate(table) if min(system) <= wave <= max(system)]
     above = sum(wave < min(system) for wave, _ in table)
     first = max((inside or [above])[0] - 1, 0)

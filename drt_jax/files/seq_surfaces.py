@@ -38,13 +38,18 @@ _Sizes = dict[str, tuple[int, float]]
 
 @dataclasses.dataclass
 class Surface(Row):
-    """A surface as its commands are read; numbers are in units of the file. gap: to the next.
+    """What the commands of a surface have set so far; numbers are in units of the file.
 
-    curvature, curvature_x: 1/unit; curvature_x with its line, or None if it is not given. kind: a
-    key of `_KINDS`. values: coefficients by key; keys of SPS are C1, C2, .... special: the type of
-    SPS. phase: values of the commands of gratings by key. glass: (line, word). moves: values of
-    `MOVES` by key. turn: DAR, BEN, REV, RET or "". target: the surface that RET returns to.
-    move_line: of the last command of these. clips: apertures by use and label, (line, size) by key.
+    gap: distance to the next surface.
+    curvature, curvature_x: 1/unit; curvature_x with its line, or None if it is not given.
+    kind: a key of `_KINDS`.
+    values: coefficients by key; the keys of SPS are C1, C2, ....
+    special: the type of SPS.
+    phase: values of the commands of gratings by key.
+    glass: (line, word).
+    moves: values of `MOVES` by key. turn: DAR, BEN, REV, RET or "". target: the surface to which
+        RET returns. move_line: line of the last command of these.
+    clips: apertures by use and label, (line, size) by key.
     """
 
     kind: str = "SPH"
@@ -93,7 +98,8 @@ class Surface(Row):
             self._special_shape()
 
     def _toroid(self) -> None:
-        """A curve in y rotated about an axis along y; XTO: in x, ours turned by 90 degrees."""
+        """A curve in y rotated about an axis along y. For XTO the curve lies in x: our toroid,
+        rotated by 90 degrees about z."""
         across = (self.curvature_x or (0, 0.0))[1] / self.unit
         along = self.curvature / self.unit
         turned = self.kind == "XTO" or (self.kind == "CYL" and across != 0)
@@ -131,9 +137,9 @@ class Surface(Row):
         self.shape(form, terms, **more)
 
     def clip(self) -> float | None:
-        """Write the apertures as entries of a prescription. Return the radius (mm) of a circle
-        about the vertex of the stop, which may be the size of the stop itself; None if there is
-        none."""
+        """Write the apertures as entries of a prescription. For the stop, return the radius (mm) of
+        a circle about its vertex, which may be the size of the stop; None if there is no such
+        circle, and for other surfaces."""
         size = None
         for (use, label), sizes in self.clips.items():
             shapes = [] if use == "EDG" else self._shapes(sizes)  # a rim clips nothing

@@ -12,7 +12,7 @@ _WIDEST = 100_000  # characters of a command over several lines
 SURFACE = re.compile(r"S(\d{1,6}|O|I)?")
 _QUALIFIER = re.compile(r"([SZFWC])(\d{1,6}|[OISK])(\.\.(?:\d{1,6}|[OISK]))?", re.IGNORECASE)
 _LABEL = re.compile(r"L(['\"].*)", re.IGNORECASE | re.DOTALL)
-# Letters of qualifiers beside S and Z, by key; with other keys, F2 is a glass.
+# Letters of qualifiers other than S and Z, by key; with other keys, F2 is a glass.
 _OTHERS = {
     "F": re.compile("[XY](AN|OB|IM|RI)|V[UL][XY]|WTF"),
     "W": re.compile("WL|WTW"),
@@ -22,7 +22,7 @@ _USES = ("CLR", "EDG", "OBS", "HOL")
 _PIECE = re.compile(r"""'[^']*'|"[^"]*"|[^'";!]+|.""", re.DOTALL)
 _WORD = re.compile(r"""(?:'[^']*'|"[^"]*"|\S)+""")
 
-# Ignored: names, drawing, variables, tolerances, ray aiming, analyses. None changes rays.
+# Ignored: names, drawing, variables, tolerances, ray aiming, analyses. They do not change rays.
 COSMETIC = """
     LEN INI GO CWL SLB DER CLS DOR WID CUM THM POL PIK AUT VER INC
     CCY CCX THC GLC KC AC BC CC DC EC FC GC HC JC XDC YDC ZDC ADC BDC CDC SCC HCC CCF
@@ -39,9 +39,14 @@ REFUSED = """
 
 @dataclasses.dataclass
 class Command(Words):
-    """A command. line: where it begins. key: its first three letters; `S` and its suffix for a
-    surface; the whole word if it is quoted. values: the words behind its qualifiers, each a letter,
-    first and last as in the file. label, use: of an aperture, "" for none."""
+    """A command.
+
+    line: line where it starts.
+    key: its first three letters; `S` and its suffix for a surface; the whole word if it is quoted.
+    values: the words behind its qualifiers. A qualifier is a letter with first and last number as
+        in the file.
+    label, use: of an aperture, "" for none.
+    """
 
     quoted: bool = False
     qualifiers: list[tuple[str, str, str]] = dataclasses.field(default_factory=list)

@@ -315,10 +315,10 @@ def _paraxial_beam(lens: Lens, wave: Array) -> Array:
 
 
 def _check_order(lens: Lens, gaps: list[float], moved: list[bool], wave: float) -> None:
-    """LensError if light would go backwards, or if neighbours overlap within both their apertures
-    and within the beam of the axis. If they overlap only outside of it, or near the rim, a warning:
-    light goes backwards there and is lost. A warning, too, for a sensor in front of the last
-    surface, where the image is virtual.
+    """LensError if light would go backwards, or if neighbouring surfaces cross within both their
+    apertures and within the axial beam. A warning if they cross only outside of the axial beam, or
+    near the rim: rays that would go backwards there are lost. Also a warning for a sensor in front
+    of the last surface, where the image is virtual.
 
     gaps, moved: see `lens.order.neighbours`, which returns the neighbours.
     wave: wavelength of the beam, um.

@@ -25,33 +25,35 @@ from .written import (
     with_short_numbers,
 )
 
-# How far the index of a private glass may be off at more wavelengths than it can be made for.
+# Largest error of the index of a private glass at more wavelengths than its formula can fit.
 _PRIVATE = 1e-6
 _WEIGHTED = ("heights", "field_weights", "vignetting", "wavelengths", "wavelength_weights")
-_CLOSE = 1e-9  # relative, and in mm, of what is read back; rounding of float32 is larger
+_CLOSE = 1e-9  # tolerance of numbers read back, relative and in mm; rounding in float32 is larger
 
 
 def save_lens(lens: Lens | System | Sequence[Lens | System], path: str | pathlib.Path) -> None:
     """Write a lens as a YAML prescription, or as a file of Zemax or CODE V if the path ends in
-    `.zmx` or `.seq`. `load_lens` reads the same lens from it, to the last digit (tilts, which files
-    hold in degrees, and model glasses and radii in `.zmx`: to the last digit but one; a number that
-    differs in the last bit from one of at most 12 digits is written as that).
+    `.zmx` or `.seq`.
 
-    The text is read back before it becomes a file: if curvatures, thicknesses, places, indices at
-    the wavelengths, the stop, apertures or, of a `System`, distance, fields, vignetting and
-    wavelengths differ beyond rounding, nothing is written. The file contains the constants of
-    glasses that differ from the catalogue's. A second medium of the same name with other constants
-    is called name*.
+    `load_lens` reads the same lens from it, to the last digit. Tilts, which files have in degrees,
+    and model glasses and radii in `.zmx` are the same to the last digit but one. A number that
+    differs only in the last bit from a decimal of at most 12 digits is written as this decimal.
 
-    lens: a lens; or a `System`, as `System.of(lens, scene)`, whose fields, wavelengths, weights,
-        vignetting and distance of the object are written into `.zmx` and `.seq` files, with the
-        size of the stop; a lens alone is written with an axial field at infinity and the d line. A
-        warning names what `.yaml` does not hold. Several systems are configurations (zoom
-        positions) of one lens, which differ in numbers: rows behind MNUM, ZOO.
-    path: of the file, which is overwritten; it ends in `.yaml`, `.yml`, `.zmx` or `.seq`.
+    The text is read back before the file is written. If curvatures, thicknesses, positions, indices
+    at the wavelengths, the stop or apertures differ beyond rounding, nothing is written; for a
+    `System` this includes distance, fields, vignetting and wavelengths. The file contains the
+    constants of glasses that differ from those of the catalogue. A second medium of the same name
+    with other constants is called name*.
 
-    LensError for another ending, if the format cannot hold the lens (a prescription has no curved
-    sensor), if `Lens.check` or `load_lens` refuse it, or if the file cannot be written.
+    lens: a lens; or a `System`, such as `System.of(lens, scene)`, whose fields, wavelengths,
+        weights, vignetting and object distance are written into `.zmx` and `.seq` files, with the
+        size of the stop. A lens alone is written with an axial field at infinity and the d line. A
+        warning names what a `.yaml` file cannot store. Several systems are configurations (zoom
+        positions) of one lens, which differ only in numbers: rows behind MNUM, ZOO.
+    path: path of the file, which is overwritten; it ends in `.yaml`, `.yml`, `.zmx` or `.seq`.
+
+    LensError for another ending, if the format cannot represent the lens (a prescription has no
+    curved sensor), if `Lens.check` or `load_lens` raise an error, or if the file cannot be written.
     """
     kind = known_ending(path)
     given = [lens] if isinstance(lens, Lens | System) else [*lens]
@@ -93,7 +95,7 @@ def _read_back(
             again, used = lens_in(text, path, configuration)
     except LensError as error:
         raise LensError(f"{error}; not written, as it could not be read back") from error
-    # A private glass of .seq stands for a model glass by six terms.
+    # In .seq, a private glass of six terms approximates a model glass.
     private = known_ending(path) == ".seq" and system.lens.dispersion.model is not None
     room = _PRIVATE if private else 0.0
     found = _difference(system.lens, again, known, room) or _use_difference(system, used)
@@ -124,10 +126,11 @@ def _yaml_text(systems: Sequence[System]) -> str:
 
 
 def _difference(one: Lens, two: Lens, waves: list[float], indices: float = 0.0) -> str:
-    """The first difference of a lens `two`, read back, from `one`, beyond rounding, as text; empty
-    if there is none. Places count from the first surface: a file need not tell where that stands.
+    """The first difference beyond rounding between a lens `one` and the lens `two` that was read
+    back, as text; empty if there is none. Positions are measured from the first surface, because a
+    file need not contain its position.
 
-    waves: wavelengths where indices are compared, um. indices: how far they may differ.
+    waves: wavelengths at which indices are compared, um. indices: their largest difference.
     """
     for name in ("count", "stop", "mirrors", "forms", "afocal"):
         a, b = getattr(one, name), getattr(two, name)
@@ -147,7 +150,8 @@ def _difference(one: Lens, two: Lens, waves: list[float], indices: float = 0.0) 
 
 
 def _use_difference(system: System, used: Mapping[str, Any]) -> str:
-    """The same of the use of a lens. used: fields of `System` that were read back."""
+    """The first difference of fields, wavelengths and aperture, as in `_difference`. used: fields
+    of `System` that were read back."""
     for name in ("field_kind", "primary"):
         a, b = getattr(system, name), used.get(name, getattr(system, name))
         if a != b:
@@ -156,14 +160,14 @@ def _use_difference(system: System, used: Mapping[str, Any]) -> str:
     for name in (*_WEIGHTED, "distance") if used else ():
         both = [np.array(own, float) for own in (getattr(system, name), used[name])]
         for found in both if name == "vignetting" else ():
-            found[:, 4] *= np.any(found[:, :4], axis=1)  # a pupil that is not vignetted may turn
+            found[:, 4] *= np.any(found[:, :4], axis=1)  # rotation of an unvignetted pupil: none
         pairs.append((name, *both, _CLOSE))
     return _first(pairs, _CLOSE)
 
 
 def _first(pairs: list[Any], close: float) -> str:
-    """The first difference of pairs of arrays, as text. pairs: name, both arrays, the absolute
-    tolerance; rows of coefficients are filled up to one length by zeros."""
+    """The first difference of pairs of arrays, as text. pairs: name, both arrays, and absolute
+    tolerance; shorter rows of coefficients are padded with zeros."""
     for name, a, b, least in pairs:
         if name in ("coefficients", "phase"):
             wide = max(a.shape[1], b.shape[1])
@@ -181,7 +185,8 @@ def _first(pairs: list[Any], close: float) -> str:
 
 
 def _numbers(lens: Lens, waves: list[float], spaced: bool) -> dict[str, np.ndarray]:
-    """Arrays of a lens by name; thicknesses if it is `spaced` by these alone."""
+    """Arrays of a lens by name. spaced: True to include thicknesses, for a lens whose surfaces are
+    placed by thicknesses alone."""
     rows, (z, across, turned) = lens.count + 1, lens.places
     decentre = np.zeros((rows, 2)) if across is None else np.asarray(across, float)
     rotation = np.tile(np.eye(3), (rows, 1, 1)) if turned is None else np.asarray(turned, float)

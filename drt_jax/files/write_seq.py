@@ -39,20 +39,20 @@ from .written import (
     place_of,
 )
 
-# By form: the type of SPS and what stands behind it, the most coefficients, and letters and number
-# of the first.
+# By form: the type of SPS with what follows it, the largest number of coefficients, and the letters
+# and the number of the first one.
 _SPECIAL = {
     "odd_asphere": ("ODD 0.0", 30, "AR", 1),
     "polynomial_xy": ("XYP 1.0", 65, "C", 2),
     "qbfs": ("QBF", 14, "C", 3),
     "zernike": ("ZFR", 91, "C", 4),
 }
-_STILL = 1e-12  # mm, radians: below this a surface stands on the axis of the one before it
+_STILL = 1e-12  # mm, radians: below this a surface is on the axis of the surface before it
 
 
 def seq_text(systems: Sequence[System]) -> str:
     """The text of a file of one zoom position or more. LensError, with the remedy, for features
-    that are not written; a warning tells how far a model glass differs that becomes a private one.
+    that are not written. If a model glass becomes a private glass, a warning gives its error.
     """
     texts = [_lines(system, len(systems) > 1) for system in systems]
     whole = ["\n".join(lines).replace(" &\n", " ").split("\n") for lines in texts]
@@ -60,7 +60,7 @@ def seq_text(systems: Sequence[System]) -> str:
 
 
 def _zooms(texts: Sequence[Sequence[str]]) -> list[str]:
-    """The commands of what differs between zoom positions, of the lines of each."""
+    """The commands for the numbers that differ between zoom positions. texts: the lines of each."""
     found = [f"ZOO {len(texts)}"] if len(texts) > 1 else []
     last = sum(line.startswith("S") for line in texts[0]) - 1
     for surface, words, at, values in differing(texts, "S"):
@@ -81,8 +81,12 @@ def _zooms(texts: Sequence[Sequence[str]]) -> list[str]:
 
 
 def _lines(system: System, several: bool) -> list[str]:
-    """The lines of one zoom position before GO; of `several` also conics and vignetting of 0, which
-    others may have."""
+    """The lines of one zoom position before GO: head, private glasses, fields and wavelengths, then
+    the surfaces with their decentres and tilts. A model glass off the normal line becomes a private
+    glass, with a warning of its error.
+
+    several: True to write conics and vignetting of 0, which may differ in other positions.
+    """
     lens, worst = system.lens, 0.0
     require(not lens.afocal, ".seq files hold no afocal image space here: save as .yaml or .zmx")
     media, own = media_of_lens(lens)
@@ -140,15 +144,17 @@ def _use(system: System, several: bool) -> list[str]:
 
 
 def _wrapped(key: str, words: Iterable[str]) -> list[str]:
-    """A command on lines that `&` continues."""
+    """A command on several lines, which `&` continues."""
     text = textwrap.wrap(f"{key} {' '.join(words)}", 100, break_on_hyphens=False)
     return [*(f"{part} &" for part in text[:-1]), text[-1]]
 
 
 def _made(keys: dict[str, Any], waves: np.ndarray) -> tuple[dict[str, Any], float]:
-    """The constants of a private glass for a constant index, or for a model glass off the normal
-    line, through its indices at the wavelengths in use and the lines F, d, C; and how far its index
-    is off elsewhere. Empty for other media."""
+    """The constants of a private glass, and the error of its index between the wavelengths.
+
+    A constant index or a model glass off the normal line becomes a private glass through its
+    indices at the wavelengths in use and the lines F, d, C. Empty for other media.
+    """
     if "index" in keys:
         return {"schott": [keys["index"] ** 2]}, 0.0
     if not keys.get("dPgF"):
@@ -197,7 +203,7 @@ def _word(keys: dict[str, Any], private: dict[str, str]) -> str:
 
 
 def _surface(i: int, entry: Mapping[str, Any]) -> list[str]:
-    """The lines of a surface but for its place."""
+    """The lines of a surface except those of its position."""
     lines = ["STO"] if "stop" in entry else []
     lines += [f"CIR {entry['semi_diameter']!r}"] if "semi_diameter" in entry else []
     lines += _form(i, entry)
@@ -274,9 +280,13 @@ def _phase(i: int, phase: Mapping[str, Any]) -> list[str]:
 
 
 def _places(lens: Lens) -> list[list[str]]:
-    """The lines of decentre and tilt of each surface and the sensor: the values of the lens if it
-    has no elements, those of elements if these turn the axis at the vertex of their first surface
-    and nothing else is moved, else those relative to the surface before."""
+    """The lines of decentre and tilt of each surface and the sensor.
+
+    They are the values of the lens if it has no elements; the values of the elements if each
+    rotates the axis at the vertex of its first surface and nothing else is moved; otherwise values
+    relative to the surface before. For these, `point` and `turn` are the vertex and the axes that
+    the next surface has without a move, and the lines are its difference from them.
+    """
     own, count = lens.elements, lens.count + 1
     places = [place_of(lens, i) for i in range(count)]
     lines = [_moves([*at.get("decentre", []), 0.0], at.get("tilt", [])) for at in places]

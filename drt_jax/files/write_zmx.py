@@ -103,8 +103,8 @@ def _numbers(name: str) -> str:
 
 
 def _surface(lens: Lens, i: int, names: Mapping[str, str], several: bool) -> list[str]:
-    """The lines of a surface but for its place. several: also a conic of 0, as others may have
-    another one."""
+    """The lines of a surface except those of its position. several: True to write a conic of 0,
+    which may differ in other configurations."""
     entry = entry_of(lens, i, {}) | ({"conic": float(lens.conic[i])} if several else {})
     lines = ["STOP"] if "stop" in entry else []
     lines += [*_form(i, entry), f"CURV {entry['curvature']!r}"]
@@ -136,7 +136,7 @@ def _form(i: int, entry: Mapping[str, Any]) -> list[str]:
     require(fits, f"surfaces[{i}]: .zmx files hold no {what} here: save as .yaml")
     if own and row[0]:
         row[0] = 1 / row[0]  # a radius
-    # The last coefficient, even 0, preserves the number of columns.
+    # The last coefficient is written even if it is 0: it preserves the number of columns.
     return [f"TYPE {kind}", *_numbered("PARM", *row[: len(numbers)])]
 
 
@@ -146,8 +146,8 @@ def _numbered(key: str, *values: float) -> list[str]:
 
 
 def _phase(i: int, name: str, phase: Mapping[str, Any], row: list[float]) -> list[str]:
-    """A grating on a conic or a toroid; or a radial phase (radians, norm radius 1 mm) on an even
-    asphere. name, row: form and coefficients of the surface."""
+    """The lines of a grating on a conic or a toroid, or of a radial phase (radians, norm radius
+    1 mm) on an even asphere. name, row: form and coefficients of the surface."""
     form, order, own = phase["form"], phase["order"], [*phase["coefficients"].values()]
     if form == "linear" and name == "asphere" and not any(row):
         return ["TYPE DGRATING", *_numbered("PARM", own[0] / 1e3, order)]
@@ -180,7 +180,7 @@ def _glass(lens: Lens, m: int, names: Mapping[str, str]) -> list[str]:
     ours = keys["nd"], keys["vd"], keys.get("dPgF", 0.0)
     theirs = to_theirs(*ours)
     rounded = ([round(value, digits) for value in theirs] for digits in range(3, 17))
-    # The fewest digits that read back.
+    # The fewest digits that are read back as the same numbers.
     short = next((values for values in rounded if to_ours(*values) == ours), theirs)
     return [f"GLAS ___BLANK 1 0 {' '.join(map(repr, short))}"]
 
@@ -196,7 +196,7 @@ def _apertures(lens: Lens, i: int) -> list[str]:
     if others and (kind != "circle" or blocks or others != ring):
         own = " and ".join(f"{'a blocking' if s[0] else 'a clear'} {s[1]}" for s in shapes)
         what = f"surfaces[{i}]: has {own}; a .zmx surface has one aperture, or a blocking circle in"
-        remedy = "put the others on plane surfaces of their own beside it, or save as .yaml"
+        remedy = "put the others on plane surfaces next to it, or save as .yaml"
         raise LensError(f"{what} a clear one of its centre: {remedy}")
     word = APERTURES[kind][blocks]
     if kind == "polygon":
@@ -229,8 +229,16 @@ def _with_breaks(
     lens: Lens, surfaces: list[list[str]], gaps: list[float]
 ) -> tuple[list[list[str]], list[float]]:
     """Insert the coordinate breaks among the blocks of lines of the S surfaces and the image.
-    Returns all blocks, and the thickness (mm) in front of each one; in front of the first it counts
-    from the first vertex before it is moved. gaps: (S,), mm, behind the surfaces."""
+
+    Each move of surfaces about a pivot becomes a break at the pivot in front of its first surface,
+    and the inverse break behind its last one. The thickness in front of a break leads along the
+    axis to its pivot, so that the thicknesses between two surfaces have the sum of their gap.
+
+    gaps: (S,), thickness behind each surface, mm.
+
+    Returns all blocks, and the thickness (mm) in front of each one. That in front of the first
+    block is measured from the first vertex before it is moved.
+    """
     moves, axis = _moves(lens), [0.0, *np.cumsum(gaps).tolist()]
     blocks: list[list[str]] = []
     behind: list[float] = []
@@ -243,7 +251,7 @@ def _with_breaks(
             about, along = move["about"], move["shift"][2]
             pivot = {before: 0.0, i: gap}.get(about, axis[about] - axis[before]) + move["pivot"]
             behind.append(pivot - at + (0.0 if back else along))
-            # With `back` the inverse: tilts in reverse order, then the decentre.
+            # `back` is the inverse: tilts in reverse order, then the decentre.
             numbers = [*move["shift"][:2], *move["tilt"]]
             values = [0.0 - value for value in numbers] if back else numbers
             lines = [f"PARM {k} {value!r}" for k, value in enumerate(values, 1) if value]

@@ -15,16 +15,16 @@ from ..lens.glasses import find_glass, glass_names
 from ..lens.lens import Lens
 from .entry import require
 
-# Most digits of a number that a person types; numbers of a file that may be such a one after
-# rounding.
+# Largest number of digits of a decimal that a person types; and a pattern of numbers that may be
+# such a decimal with a rounding error.
 _TYPED = 12
 _LONG = re.compile(r"(?<![\w.])-?\d+\.\d{9,}(e[-+]?\d+)?(?![\w.])")
 Shape = tuple[bool, str, list[float], list[float]]
 
 
 def number_for(target: float, read: Callable[[float], float], *guesses: float) -> float:
-    """The shortest decimal of the last of `guesses`, else the first of them, or the number near the
-    last, that `read` maps to `target`, or as close to it as possible."""
+    """The number that `read` maps closest to `target`, of: decimals of the last guess, the shortest
+    first; the guesses; and the neighbours of the last guess. Of equally close ones, the first."""
     last = guesses[-1]
     near = (last + np.arange(-8, 9) * np.spacing(abs(last))).tolist()
     return min([*_decimals(last), *guesses, *near], key=lambda number: abs(read(number) - target))
@@ -36,14 +36,15 @@ def _decimals(number: float) -> list[float]:
 
 
 def with_short_numbers(text: str) -> str:
-    """The text of a file with decimals as a person types them: those of at most 12 digits in place
-    of numbers that differ in the last bit, such as 587.5618 for 587.5618000000001."""
+    """The text of a file with decimals as a person types them. A number that differs only in the
+    last bit from a decimal of at most 12 digits is replaced by it: 587.5618 for
+    587.5618000000001."""
 
     def short(match: re.Match[str]) -> str:
         number = float(match[0])
         near = (own for own in _decimals(number) if abs(own - number) <= np.spacing(abs(number)))
         found = next(map(repr, near), match[0])
-        return found if "." in found else found.replace("e", ".0e")  # as YAML knows numbers
+        return found if "." in found else found.replace("e", ".0e")  # YAML needs a point
 
     return _LONG.sub(short, text)
 
@@ -84,7 +85,8 @@ def entry_of(lens: Lens, i: int, behind: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _coefficients(name: str, row: Any) -> dict[str, Any]:
-    """The coefficients of a form: keys of their own, and the others by their names in files."""
+    """The coefficients of a form: those with keys of their own, and the others by their names in
+    files."""
     form, values = FORMS[name], np.asarray(row).tolist()
     rest = dict(zip(form.powers, values[len(form.named) :], strict=False))
     return dict(zip(form.named, values, strict=False)) | {"coefficients": rest}
@@ -136,9 +138,12 @@ def _apertures(lens: Lens, i: int) -> dict[str, Any]:
 
 
 def shapes_of(lens: Lens, i: int) -> list[Shape]:
-    """All that clips rays at a surface, sorted: whether it blocks, its kind, its size (half widths
-    in x and y, twice the radius of a circle, x and y of all corners of a polygon) and its centre,
-    mm. A semi-diameter is a circle like others, but that of the stop is no aperture."""
+    """All apertures and obscurations of a surface, sorted.
+
+    Each has: whether it blocks light, its kind, its size (half widths in x and y; for a circle its
+    radius twice; for a polygon x and y of all corners) and its centre, mm. A semi-diameter is a
+    circle like others, except that of the stop, which is not an aperture.
+    """
     own, semi, found = _apertures(lens, i), float(lens.semi_diameter[i]), list[Shape]()
     if math.isfinite(semi) and i != lens.stop:
         own.setdefault("aperture", []).append({"circle": semi})
@@ -151,10 +156,10 @@ def shapes_of(lens: Lens, i: int) -> list[Shape]:
 
 
 def medium_of(lens: Lens, i: int) -> dict[str, Any] | None:
-    """Prescription keys of medium i; None if only its constants describe it."""
+    """Prescription keys of medium i; None if it can be described only by its constants."""
     own = constants_of(lens.dispersion, i)
     if lens.dispersion.model is not None and lens.dispersion.model[i, 0] != 1:
-        what = f"glasses[{i}]: a prescription has no constants beside nd and vd"
+        what = f"glasses[{i}]: a prescription has nd and vd and no other constants"
         require(not own.keys() - {"range"}, what)
         nd, vd = np.asarray(lens.dispersion.model[i]).tolist()
         dPgF = lens.dispersion.dPgF
@@ -177,7 +182,7 @@ def medium_of(lens: Lens, i: int) -> dict[str, Any] | None:
 
 
 def constants_of(dispersion: Dispersion, i: int) -> dict[str, Any]:
-    """The constants of medium i as a prescription's `glasses` hold them; empty for air."""
+    """The constants of medium i as in `glasses` of a prescription; empty for air."""
     parts = (dispersion.strength, dispersion.resonance, dispersion.schott)
     strength, resonance, schott = (np.asarray(part[i]).tolist() for part in parts)
     terms = max((k + 1 for k, pair in enumerate(zip(strength, resonance)) if any(pair)), default=0)
@@ -194,13 +199,13 @@ def constants_of(dispersion: Dispersion, i: int) -> dict[str, Any]:
 
 
 def media_of_lens(lens: Lens) -> tuple[list[dict[str, Any]], dict[str, Any]]:
-    """Keys of each medium, none for air, and the glasses that the file has to define."""
+    """Keys of each medium (empty for air), and the glasses that the file must define."""
     plain = [medium_of(lens, i) for i in range(lens.count + 1)]
     described = {name for name, keys in zip(lens.glasses, plain, strict=True) if keys is None}
     media: list[dict[str, Any]] = []
     glasses: dict[str, Any] = {}
     for i, (name, keys) in enumerate(zip(lens.glasses, plain, strict=True)):
-        if i and name == lens.glasses[i - 1]:  # light keeps the constants of the medium in front
+        if i and name == lens.glasses[i - 1]:  # same medium: the constants of the one in front
             keys = media[-1]
         elif keys is None or keys.get("glass") in described:
             own = constants_of(lens.dispersion, i)
@@ -214,11 +219,13 @@ def media_of_lens(lens: Lens) -> tuple[list[dict[str, Any]], dict[str, Any]]:
 def differing(
     texts: Sequence[Sequence[str]], begins: str
 ) -> Iterator[tuple[int, list[str], int, list[str]]]:
-    """The words that differ between the lines of C configurations of one lens, without its name:
-    number of the surface, -1 in front of the first; words of the line in the first configuration;
-    number of the word; the C words. LensError if the lines themselves are others.
+    """The words that differ between the lines of C configurations of one lens, except its name.
 
-    begins: the beginning of the first line of each surface.
+    Each is a tuple: number of the surface (-1 in front of the first); words of the line in the
+    first configuration; number of the word; the C words. LensError if the configurations do not
+    have the same lines.
+
+    begins: start of the first line of each surface.
     """
     what = "configurations differ in more than numbers: glasses, forms, tilts, fields or apertures"
     require(len({*map(len, texts)}) == 1, what)

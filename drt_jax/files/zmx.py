@@ -27,7 +27,7 @@ from .zmx_surfaces import TYPES, Surface
 _UNITS = {"MM": 1.0, "CM": 10.0, "IN": 25.4, "M": 1000.0, "METER": 1000.0}
 _MOST = 1000  # fields or wavelengths
 COLUMNS = ("XFLN", "YFLN", "FWGN", "VDXN", "VDYN", "VCXN", "VCYN", "VANN")
-# Lists of older versions, which later ones write beside their own; read where those are absent.
+# Lists of older versions. Later versions also write them; they are read if the new ones are absent.
 _OLD = ("XFLD", "YFLD", "FWGT", "ZVDX", "ZVDY", "ZVCX", "ZVCY", "ZVAN")
 _WAVES = (("WAVN", "WWGN"), ("WAVL", "WWGT"))
 _LISTS = {*COLUMNS, *_OLD, *sum(_WAVES, ())}
@@ -38,7 +38,7 @@ _APERTURES: dict[str, tuple[ApertureKind, ApertureKind]] = {
     "FNUM": ("f-number", "working f-number"),
     "OBNA": ("object NA", "object cone angle"),
 }
-# Ignored: drawing, names, tolerances, analyses, coatings, polarisation. None changes rays.
+# Ignored: drawing, names, tolerances, analyses, coatings, polarisation. They do not change rays.
 _COSMETIC = """
     VERS MODE PFIL LANG GFAC PUSH SDMA ROPD PICB POLS GLRS GSTD NSCD COFN NOTE AUTH
     IWDP HYPR LUID EERA FIMP HIDE MIRR SLAB POPS COMM BLNK PRIM COAT VPAR VDSZ VCON
@@ -49,11 +49,14 @@ _SOLVES = ("PPAR", "PZUP", "MAZH", "CHZH", "EDGE", "PKUP")
 
 @dataclasses.dataclass
 class Head:
-    """The header as its lines are read; `record.use` has lengths in mm.
+    """What the lines of the header have set so far; `record.use` has lengths in mm.
 
-    unit: the file's unit of length, mm. makers: the catalogues of GCAT. counts: of fields and of
-    wavelengths, where FTYP tells them. columns: numbers per field or wavelength by keyword. more:
-    lines FEFD, one per field from the 13th on. waves: wavelength (um) and weight by number.
+    unit: unit of length of the file, mm.
+    makers: the catalogues of GCAT.
+    counts: number of fields and of wavelengths, if FTYP has them.
+    columns: numbers per field or wavelength, by keyword.
+    more: lines FEFD, one per field from the 13th on.
+    waves: wavelength (um) and weight by number.
     """
 
     record: Record
@@ -101,7 +104,7 @@ class Head:
                 if used and (degrees, pressure) != (20, 1):
                     what = f"{degrees:g} C and {pressure:g} atm; ours are 20 and 1"
                     record.lacks(words.line, what)
-            case key if key in _LISTS:  # what is beyond the number of fields is not used
+            case key if key in _LISTS:  # entries beyond the number of fields are not used
                 self.columns[key] = words.numbers(0, min(len(words.values), _MOST))
             case _:
                 return False
@@ -146,8 +149,8 @@ class Head:
         use.vignetting = [*map(list, zip(*parts, strict=True))]
 
     def _column(self, key: str, fields: int) -> list[float]:
-        """The numbers of all fields; those of a column that the file does not have are 1 for
-        weights, else 0."""
+        """The numbers of a column for all fields. If the file does not have the column, they are 1
+        for weights and 0 for others."""
         k, found = COLUMNS.index(key), self.columns[key]
         found = found or [float(key == "FWGN")] * (min(fields, BESIDE) if self.more else fields)
         found = found[:BESIDE] + [row[k] for row in self.more] if self.more else found
@@ -164,14 +167,21 @@ def _positive(record: Record, line: int, value: float) -> float:
 def read_zmx(
     path: str, missing: Missing, lines: list[str], configuration: int | None = None
 ) -> Record:
-    """Read the lines of a `.zmx` file into a record of its surfaces and their use. LensError with
-    the line. path: its name in messages. configuration: see `load_system`."""
+    """Read the lines of a `.zmx` file into a record of its surfaces, fields, wavelengths and
+    aperture. LensError with the line.
+
+    `choose` first writes the numbers of the configuration into the lines. Lines before the first
+    SURF belong to the header, lines behind it to the last surface. The surfaces end at MNUM, at the
+    first line that is not indented, or at the first key of the merit function; the rest is ignored.
+
+    path: its name in messages. configuration: see `load_system`.
+    """
     record, surfaces, tail = Record(path, missing), list[Surface](), False
     head, found = Head(record), words_of(record, lines)
     choose(record, found, configuration)
     whole = not any(words.key == "VERS" for words in found)
     indented = any(w.indented for w in found if w.key in ("TYPE", "CURV", "DISZ"))
-    own: Head | Surface = head  # to which lines belong
+    own: Head | Surface = head  # reads the present line
     for words in found:
         if words.key == "MODE":
             sequential = words.values[:1] in (["SEQ"], [])

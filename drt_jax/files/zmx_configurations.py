@@ -1,7 +1,7 @@
 """Configurations of `.zmx` files: rows behind MNUM, one for each configuration.
 
-The surfaces and the header have the numbers of the current configuration. The rows of another one
-are written over them before they are read.
+The surfaces and the header have the numbers of the current configuration. To read another one, its
+rows replace these numbers in the lines before the lines are read.
 """
 
 import collections
@@ -11,8 +11,8 @@ from .entry import LensError
 from .record import Record, Words
 from .written import differing
 
-# The keyword of a surface, of a list over fields and of the entry of a wavelength that a row
-# changes.
+# By keyword of a row: the keyword that it changes, of a surface, of a list over fields and of a
+# wavelength.
 _SURFACE = {"THIC": "DISZ", "CRVT": "CURV", "CONN": "CONI", "SDIA": "DIAM"}
 _FIELD = {
     "XFIE": "XFLN", "YFIE": "YFLN", "FLWT": "FWGN", "FVDX": "VDXN", "FVDY": "VDYN",
@@ -25,10 +25,10 @@ _AIR = "TEMP", "PRES"
 
 
 def choose(record: Record, found: list[Words], configuration: int | None) -> None:
-    """Write the numbers of a configuration over those of the current one, in place.
+    """Replace the numbers of the current configuration by those of another one, in place.
 
-    LensError for a number that the file does not have; where a row that differs is not known, as in
-    `Record.lacks`.
+    LensError if the file has no such configuration. A row of an unknown kind that differs between
+    configurations is treated by `Record.lacks`.
 
     found: the lines of the file. configuration: its number in the file, from 1; None for the
     current one.
@@ -62,14 +62,14 @@ def _operands(found: list[Words], count: int) -> list[list[Words]]:
 
 
 def _write(record: Record, found: list[Words], row: Words) -> None:
-    """Write the number of a row over the one that is read."""
+    """Replace the number that a row changes."""
     key, where, value = row.key, row.count(), row.values[2]
     what = f"{key}, which differs between configurations"
     if key in _AIR:
         return record.lacks(row.line, what)
     known = key in (*_SURFACE, *_FIELD, *_WAVE, "APER")
     row.require(known, f"{what}: not supported; save each configuration as a file of its own")
-    row.number(2)  # LensError for what is no number
+    row.number(2)  # LensError if it is not a number
     first = next((k for k, words in enumerate(found) if words.key == "SURF"), 0)
     head = found[:first]
     what = f"{key} {where}: the file has none"
@@ -98,8 +98,8 @@ def _write(record: Record, found: list[Words], row: Words) -> None:
 
 
 def rows(texts: Sequence[Sequence[str]]) -> list[str]:
-    """The lines from MNUM on, of the lines of a file for each configuration. LensError for lines
-    that differ and that no row changes."""
+    """The lines from MNUM on. texts: the lines of the file for each configuration. LensError if
+    they differ in something that no row can change."""
     of_surface, of_field = ({own: row for row, own in t.items()} for t in (_SURFACE, _FIELD))
     of_wave = {place: row for row, place in _WAVE.items()}
     found = [f"MNUM {len(texts)} 1"]

@@ -37,12 +37,15 @@ _APERTURES = {
 
 @dataclasses.dataclass
 class Surface(Row):
-    """A surface as its lines are read; XDAT begins at number 13 of its `values`.
+    """What the lines of a surface have set so far; XDAT starts at number 13 of its `values`.
 
-    makers: the catalogues of the header. gap, semi: DISZ and DIAM, mm. apertures: line, keyword and
-    two lengths (mm) of each, about `centre`. moves: the values of a coordinate break in front of
-    the surface (1) and behind it (2). user, corners: the keyword of a user aperture and its corners
-    [x, y], mm. `lines` has FLAP and `user` if the surface has a floating or a user aperture.
+    makers: the catalogues of the header.
+    gap, semi: DISZ and DIAM, mm.
+    apertures: line, keyword and two lengths (mm) of each aperture, about `centre`.
+    moves: the values of a coordinate break in front of the surface (1) and behind it (2).
+    user, corners: the keyword of a user aperture and its corners [x, y], mm.
+
+    `lines` has FLAP and `user` if the surface has a floating or a user aperture.
     """
 
     kind: str = "STANDARD"
@@ -121,7 +124,7 @@ class Surface(Row):
         if name == "___BLANK":
             return model_keys(self, line, words.number(3), words.number(4), words.number(5, 0))
         beside: dict[str, Any] = {}
-        try:  # nd and vd behind a name, but for the placeholder 1.5 and 40 of OpticStudio
+        try:  # nd and vd behind a name, unless they are OpticStudio's placeholders 1.5 and 40
             nd, vd, above = (words.number(i, 0.0) for i in (3, 4, 5))
             if nd > 1 and (nd, vd) != (1.5, 40):
                 beside = model_keys(self, line, nd, vd, above)
@@ -141,8 +144,8 @@ class Surface(Row):
             self.moves[where] = {k: (words.line, value) for k, value in enumerate(six, 1)}
 
     def _corner(self, words: Words) -> None:
-        """UDAD: number, x, y, 0 of a corner; number 0 is of a line with the name of a file, whose
-        scale comes last."""
+        """UDAD: number, x, y, 0 of a corner. A line with the number 0 names a file and ends with
+        its scale."""
         values, number = words.values, words.count()
         self.lines.setdefault("user", words.line)
         if number == 0:
@@ -155,8 +158,8 @@ class Surface(Row):
         self.corners.append(self._lengths(words, 1))
 
     def clip(self) -> None:
-        """Set apertures and obscurations. DIAM alone clips nothing, nor does an aperture beyond the
-        end of the surface."""
+        """Set apertures and obscurations. Neither DIAM alone nor an aperture beyond the domain of
+        the sag clips rays."""
         about: dict[str, Any] = {"centre": self.centre} if any(self.centre) else {}
         floating = self.lines.get("FLAP", 0)
         rim = [(floating, "CLAP", [0.0, self.semi])] if floating else []
@@ -191,7 +194,7 @@ class Surface(Row):
             self.put_shape(key, about | {kind: corners}, line)
 
     def only(self, known: Collection[int] | None) -> None:
-        """Refuse nonzero parameters whose number is not in `known`; None refuses none."""
+        """LensError for nonzero parameters whose number is not in `known`; None accepts all."""
         for number, (line, value) in self.values.items():
             if known is not None and value and number not in known:
                 extra = f" (XDAT {number - EXTRA + 1})" if number >= EXTRA else ""
@@ -200,7 +203,7 @@ class Surface(Row):
 
     def series(self, first: int = EXTRA) -> tuple[float, list[float]]:
         """The norm radius (mm) of a series, and its values as in the file. From parameter `first`
-        on, the file holds the number of values, the radius and the values; others are ignored."""
+        on, the file has the number of values, the radius, and the values; the rest is ignored."""
         count, radius = self.value(first), self.value(first + 1) * self.unit
         line = self.values.get(first, (self.line, 0))[0]
         self.require(count % 1 == 0 and 0 <= count <= 300, f"{count:g} terms; give 0 to 300", line)
@@ -210,7 +213,7 @@ class Surface(Row):
         return radius, found
 
     def spread(self, radius: float, found: dict[Any, tuple[float, int]]) -> dict[Any, float]:
-        """Coefficients by key: each value of `found` over the given power of the radius."""
+        """Coefficients by key: each value of `found` divided by the given power of the radius."""
         with np.errstate(all="ignore"):
             terms = {k: float(v / np.float64(radius) ** p) for k, (v, p) in found.items() if v}
         for key, value in terms.items():
@@ -352,7 +355,8 @@ def _tilted(surface: Surface) -> None:
     surface.shape("polynomial_xy", {"x1y0": surface.value(1), "x0y1": surface.value(2)})
 
 
-# By type: what makes entries of its parameters, and the numbers of these; None: all are ignored.
+# By type: the function that converts its parameters to entries, and the numbers of the parameters
+# that it reads. Others must be 0; with None they are ignored.
 TYPES: dict[str, tuple[Callable[[Surface], None], Collection[int] | None]] = {
     "STANDARD": (lambda surface: None, None),
     "EVENASPH": (lambda surface: surface.shape("asphere", surface.powers(_EVEN)), _EIGHT),

@@ -72,8 +72,8 @@ def changes(distance: Array, closed: bool, most: int) -> tuple[Array, Array]:
     last = distance.shape[-1] - 1
     index = np.arange(last)[:, None] + np.arange(-2, 4)
     index = index % last if closed else last - abs(last - abs(index))
-    # Clip distances at 4 times the longest spoke, so that far edges do not spoil the interpolation.
-    # No spoke is longer than 2.
+    # Clip distances at 4 times the longest spoke, so that far edges do not disturb the
+    # interpolation. No spoke is longer than 2.
     far = 4 * jnp.minimum(jnp.max(jnp.min(distance, axis=0), axis=-1), 2)
     distance = jnp.clip(distance, 0, far[None, :, None])[..., index]
     distance = distance @ jnp.asarray(_taps(), distance.dtype)

@@ -1,4 +1,4 @@
-"""Rays that are found outside of `jax.jit`, by programs that all analyses of a lens share.
+"""Rays that are found outside of `jax.jit`, by compiled programs that all analyses of a lens share.
 
 The search for rays is most of what an analysis compiles. An analysis of known numbers therefore
 finds its rays first, in tiles of one size (`known_rays`), and its own program only gives them
@@ -33,11 +33,11 @@ _MOST = 1024
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Known:
-    """A `Solver` of rays that were found before; it searches if there are none.
+    """A `Solver` that returns rays that were found before; it searches if there are none.
 
-    found: the rays; None for a search. Of a scene of several points, they are the first axis (P,)
-        of all arrays.
-    plan: what `PupilRule.plan` found, with the same axis.
+    found: the rays; None for a search. For a scene of several points, the P points are the first
+        axis of all arrays.
+    plan: result of `PupilRule.plan`, with the same first axis.
     """
 
     found: Found | None = None
@@ -59,10 +59,10 @@ def known_rays(
     sampling: Any,
     aim: Callable[[Lens, Scene, Any], tuple[Vector, Any]] | None = None,
 ) -> Known:
-    """Rays of all points of a scene; nothing inside of `jax.jit` and `jax.vmap`, and for more than
-    1024 rays.
+    """Finds the rays of all points of a scene. The result has no rays inside of `jax.jit` and
+    `jax.vmap`, and for more than 1024 rays.
 
-    sampling: stop points, D arrays (Q,) or (W, Q); or what `aim` makes them from.
+    sampling: stop points, D arrays (Q,) or (W, Q); or the argument from which `aim` makes them.
     aim: function of the lens, a scene of one point, and the sampling. Returns stop points and a
         plan.
     """
@@ -105,8 +105,8 @@ def tiles(stop: np.ndarray) -> list[np.ndarray]:
 
 
 def joined(parts: Iterable[Any], count: int) -> Any:
-    """Trees of arrays (..., Q) of tiles as one with the first `count` rays, NumPy; of scalars
-    the largest."""
+    """Joins trees of arrays (..., Q) of tiles along the rays, and keeps the first `count` rays, as
+    NumPy arrays. Of scalars it keeps the largest."""
 
     def join(*arrays: Array) -> np.ndarray:
         every = [np.asarray(a) for a in arrays]

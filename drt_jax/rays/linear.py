@@ -135,6 +135,10 @@ def _step(
 def solve(path: Path, system: System, ok: Array, rhs: RightSide) -> tuple[Vector, Vector]:
     """Solves the linear system.
 
+    One `lax.scan` over the rows propagates D changes `free`, one for each unit change of the first
+    hit, and the change `forced` by the right-hand side alone. The D x D system of the label gives
+    the weights of the free changes in their sum with the forced one.
+
     ok: (W, Q), bool, rays of interest. The result for other rays is arbitrary, but finite if their
         paths are.
     rhs: the right-hand side. The result is linear in it.

@@ -73,8 +73,12 @@ def configuration(text: str) -> int | str:
 
 
 def output(options: argparse.Namespace, say: Callable[[str], None]) -> Iterator[Line]:
-    """Data of a lens as they are computed, as lines and rows of tables; and draws its sheet.
-    ValueError for wrong options. say: called with the name of each step."""
+    """Yields the data of a lens, as lines and rows of tables, when they are computed; draws its
+    sheet. ValueError for wrong options. say: called with the name of each step.
+
+    The fast results come first: first-order data, then a file with the drawing, then spots and
+    warnings. The sheet or page with all analyses replaces the file at the end.
+    """
     if not all(abs(field) < 90 for field in options.field or ()):
         raise ValueError("--field: must be within 90 degrees")
     if options.configuration == "all":
@@ -92,7 +96,7 @@ def output(options: argparse.Namespace, say: Callable[[str], None]) -> Iterator[
     view = view.lit()
     scene, fields = view.scene, view.fields
     out, web = _file_of(options)
-    # The drawing is there in seconds; the sheet, or the whole page, replaces it.
+    # The drawing is written after some seconds; the sheet, or the whole page, replaces it.
     data: list[tuple[str, Part]] = [("First-order data", first)]
     drawing, axes = new(1, 1, 11.0, 4.5)
     lens_drawing(axes, draw(lens, scene))
@@ -129,7 +133,7 @@ def output(options: argparse.Namespace, say: Callable[[str], None]) -> Iterator[
 
 
 def _all_told(options: argparse.Namespace) -> Iterator[Line]:
-    """A table of all configurations of a file, which are drawn under each other."""
+    """A table of all configurations of a file, whose layouts are drawn below each other."""
     path = pathlib.Path(options.lens)
     several = path.suffix.lower() in OTHERS
     require(several, f"--configuration all: {path.name} has one; expected a .zmx or .seq file")
@@ -166,13 +170,13 @@ def _file_of(options: argparse.Namespace) -> tuple[pathlib.Path, bool]:
 
 
 class View(NamedTuple):
-    """What is shown.
+    """The lens and the scene that are shown.
 
     lens: the lens.
-    fields: degrees; an empty list if neither options nor file name any, see `lit`.
+    fields: degrees; an empty list if neither options nor file give any, see `lit`.
     distance: of the object, mm.
-    wavelengths, weights: um, the middle one is the reference; and their weights.
-    note: a line on what of a file is left out, or "".
+    wavelengths, weights: wavelengths, um, of which the middle one is the reference, and weights.
+    note: a line about wavelengths of the file that are left out, or "".
     """
 
     lens: Lens
@@ -184,14 +188,14 @@ class View(NamedTuple):
 
     @property
     def scene(self) -> Scene:
-        """The scene."""
+        """The scene of the fields, distance and wavelengths."""
         waves, weights = np.array(self.wavelengths), np.array(self.weights)
         shown = Scene.degrees(self.fields, self.distance, waves, wavelength_weights=weights)
         return checked_scene(self.lens, shown)
 
     def lit(self) -> "View":
-        """The view with fields: if it has none, 0, 7 and 10 degrees, the last two halved until half
-        of the light of the axis arrives."""
+        """The view with fields. If it has none, they are 0, 7 and 10 degrees, and the last two are
+        halved until their throughput is at least half of that on the axis."""
         if self.fields:
             return self
         fields = np.array([0.0, 7.0, 10.0])
@@ -205,7 +209,7 @@ class View(NamedTuple):
 
 
 def view_of(options: argparse.Namespace) -> View:
-    """What the options and a file ask for. Options override the values of a .zmx or .seq file."""
+    """The view that options and file give. Options override the values of a .zmx or .seq file."""
     fields, left = list[float](), list[str]()
     distance, waves = math.inf, list(_LINES)
     weights = {wave: 1.0 for wave in waves}
@@ -252,7 +256,7 @@ def focus_lines(found: FirstOrder, wavelength: float, axial: Beam) -> Iterator[s
 def field_rows(
     lens: Lens, scene: Scene, fields: list[float], beams: list[Beam]
 ) -> Iterator[tuple[str, ...] | str]:
-    """A table of spots of the points of a scene, with warnings as lines between its rows.
+    """A table with the spots of all points of a scene, with warnings as lines between its rows.
 
     fields: the fields in degrees.
     """
@@ -308,7 +312,7 @@ def _rule(lens: Lens, order: int, symmetry: Symmetry, whole: bool) -> PupilRule:
 
 
 def aperture_lines(lens: Lens, beams: list[Beam]) -> Iterator[str]:
-    """Warnings of clear apertures that are so wide that they clip nothing."""
+    """Warnings of clear apertures so wide that they clip no ray."""
     needed = np.max([beam.wide for beam in beams], axis=0)
     for i, semi in enumerate(np.asarray(lens.semi_diameter)[:-1]):
         if math.isfinite(semi) and semi > 1.8 * needed[i] > 0:

@@ -13,9 +13,9 @@ from drt_jax.pupil import hexapolar
 
 from . import _common, _plots
 
-# What is told of other optimisers by the median of their starts.
+# Columns of the table of other optimisers: medians over their starts.
 _MEDIANS = "met_jacobians", "met_s", "seconds"
-# Most ranked minima; rings of rays of a drawn spot.
+# Largest number of ranked minima; rings of rays of a drawn spot.
 _RANKED, _RINGS = 30, 8
 
 

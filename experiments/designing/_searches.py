@@ -18,10 +18,11 @@ class Starts:
     """Starts of the search.
 
     count: number of searches.
-    how: "normal", about the lens; "sobol", within the bounds; "as_built", lenses with errors.
-    spread: of "normal", standard deviation in scales of the variables.
-    per_cent, off_mm: of "as_built", standard deviations of curvatures and thicknesses.
-    stages: trials of each search in each stage.
+    how: "normal", normally distributed about the lens; "sobol", Sobol points within the bounds;
+        "as_built", lenses with errors.
+    spread: for "normal", standard deviation in scales of the variables.
+    per_cent, off_mm: for "as_built", standard deviations of curvatures and thicknesses.
+    stages: number of trials of each search in each stage.
     keep: fraction of searches that survive a stage.
     """
 
@@ -36,7 +37,7 @@ class Starts:
 
 
 class Progress(tqdm):
-    """A progress bar with the merit and the worst limit."""
+    """A progress bar with the merit and the largest violation of a limit."""
 
     def __init__(self, title: str, total: int):
         super().__init__(total=total, desc=title, unit="trial", dynamic_ncols=True)
@@ -67,8 +68,8 @@ def starts_of(variables: Any, starts: Starts) -> np.ndarray:
 
 
 def searched(problem: AnyProblem, starts: Starts, devices: int = 1) -> dict[str, Any]:
-    """Vectors at the ends of the searches from the starts, best first, with counts and times;
-    `scores` are those of all starts, None where no ray ever passed."""
+    """Vectors at the ends of the searches from the starts, best first, with counts and times.
+    `scores` has the scores of all starts, None where no ray passed in any trial."""
     variables = problem.variables
     if starts.count == 1:
         nothing = {"trials": 0, "jacobians": 0, "seconds": 0.0, "compile_s": 0.0}

@@ -1,8 +1,8 @@
-"""Design a lens: least squares on exact Jacobians, within limits, from one start or from many.
+"""Design a lens: least squares with exact Jacobians and limits, from one start or from many.
 
 The settings name variables, operands and starts. Writes the designed lens as designed.yaml, which
-load_lens reads back, the start and other minima beside it, figures, and results.json: `rows` with
-`problem`, `merit_start`, `merit_end`, `spots_um`, `jacobians`, `rays`, `seconds`, `compile_s`.
+load_lens reads; in the same folder the start and other minima, figures, and results.json: `rows`
+with `problem`, `merit_start`, `merit_end`, `spots_um`, `jacobians`, `rays`, `seconds`, `compile_s`.
 `python -m comparisons.design` adds results of other optimisers.
 """
 
@@ -30,18 +30,19 @@ from ._searches import Progress, Starts, searched, starts_of as starts_of
 from .runs.folder import Run
 
 COLUMNS = ("merit", "worst", "jacobians")
-_DRAWN = 6  # most minima that are drawn
+_DRAWN = 6  # largest number of minima that are drawn
 
 
 @dataclasses.dataclass(frozen=True)
 class Growth:
-    """Design for a part of field and aperture first, then for more.
+    """Growth: the lens is first designed for a part of field and aperture, then for larger parts.
 
     first: part at the start; 1 for no growth.
     step: step to the next part.
-    trials: most trials at each part; a step that misses good_um then is halved.
-    good_um: root mean square of the RMS radii at which the next part begins, about four times that
-        of the final lens: a lens that is perfect for a part is bad for more, see docs/design.md.
+    trials: largest number of trials at each part; if good_um is not reached, the step is halved.
+    good_um: root mean square of the RMS radii at which the next part starts, about four times that
+        of the final lens. A lens that is perfect for a part is bad for a larger part, see
+        docs/design.md.
     """
 
     first: Annotated[float, within(0.01, 1)] = 1.0
@@ -52,10 +53,12 @@ class Growth:
 
 @dataclasses.dataclass(frozen=True)
 class Glasses:
-    """Real glasses in place of model glasses, in the end.
+    """Real glasses, which replace the model glasses at the end.
 
-    makers: of the glasses; none: model glasses stay. names: a pattern of names, such as "N-*".
-    count: glasses tried in each place. steps: of least squares with each.
+    makers: makers of the glasses; empty to keep the model glasses.
+    names: pattern of names, such as "N-*".
+    count: number of glasses tried for each model glass.
+    steps: steps of least squares with each.
     """
 
     makers: tuple[str, ...] = ()
@@ -79,13 +82,14 @@ class Config(LensFile):
     fields_deg: field angles along y.
     wavelengths_um, colour_weights: wavelengths and their weights; empty for equal weights.
     field_weights: weights of the squares of each field; empty for equal weights.
-    floating: True for clear apertures that follow the light, except the stop's; False for
-        vignetting.
+    floating: True for clear apertures, except the stop's, that follow the size of the beam; False
+        for vignetting.
     order: order of the pupil rule of the search.
-    tolerance: relative error of the spots, which fixes the rule for the last search.
-    rings: above 0, rings of a hexapolar grid instead of both rules, as in other programs.
-    trials: most trials of the last search.
-    devices: that share the searches from many starts, see docs/devices.md.
+    tolerance: relative error of the spots, which determines the rule of the last search.
+    rings: above 0: number of rings of a hexapolar grid, which replaces both rules, as in other
+        programs.
+    trials: largest number of trials of the last search.
+    devices: number of devices for the searches from many starts, see docs/devices.md.
     """
 
     name: str
@@ -150,8 +154,8 @@ def order_of(config: Config, lens: drt_jax.Lens) -> int:
 
 
 def grown(config: Config, problem: design.Problem, run: Run) -> drt_jax.Lens:
-    """Designs the lens for growing parts of field and aperture. ConfigError, with the reason and
-    the remedy, if growth stops."""
+    """Designs the lens for larger and larger parts of field and aperture. ConfigError, with the
+    reason and the remedy, if growth stops."""
     settings, count = config.growth, len(config.fields_deg)
     target = count * (1e-3 * settings.good_um) ** 2
     saved = run.kept("growth")
@@ -185,7 +189,7 @@ def finished(config: Config, problem: design.Problem, found: dict[str, Any]) -> 
             parts.append(design.optimise(problem, vector, config.trials, bar.searched))
     history = np.concatenate([part.history for part in parts])
     first = parts[0].history
-    history[len(first) :, 2] += first[-1, 2]  # Jacobians count on
+    history[len(first) :, 2] += first[-1, 2]  # number of Jacobians of both searches
     end, glasses = snapped(config, problem, parts[-1])
     return {
         "vector": end.vector.tolist(),
@@ -202,7 +206,7 @@ def finished(config: Config, problem: design.Problem, found: dict[str, Any]) -> 
 def snapped(
     config: Config, problem: design.Problem, found: design.Optimum
 ) -> tuple[design.Optimum, dict[str, Any]]:
-    """The optimum, with real glasses if these are wanted, and what each of them has cost."""
+    """The optimum, with real glasses if makers are given; and the cost of each of them."""
     some, begun = config.glasses, time.perf_counter()
     if not some.makers:
         return found, {}
@@ -218,7 +222,7 @@ def snapped(
 
 
 def _designed(variables: design.Variables, end: dict[str, Any]) -> drt_jax.Lens:
-    """The lens of the end, with its glasses."""
+    """The lens at the end of the search, with its glasses."""
     lens, snaps = variables.lens, end["glasses"].get("snaps", [])
     for surface, name in {i: snap["glass"] for snap in snaps for i in snap["surfaces"]}.items():
         lens = drt_jax.with_glass(lens, drt_jax.find_glass(name), [surface])
@@ -227,8 +231,8 @@ def _designed(variables: design.Variables, end: dict[str, Any]) -> drt_jax.Lens:
 
 
 def _foci(config: Config, lens: drt_jax.Lens) -> list[float]:
-    """(W,), the focus of light through 0.7 of the aperture less that of the last wavelength, over
-    the focal length."""
+    """(W,), focus of rays at 0.7 of the aperture minus that of the last wavelength, divided by the
+    focal length."""
     waves = config.wavelengths_um
     scene = Scene.point(0.0, config.distance_mm, waves)
     foci = np.asarray(drt_jax.axial_colour(lens, scene, (0.7,)).real)[:, 0]
@@ -236,7 +240,11 @@ def _foci(config: Config, lens: drt_jax.Lens) -> list[float]:
 
 
 def run(config: Config, run: Run) -> dict[str, Any]:
-    """Grows, searches, finishes, and writes the lens."""
+    """Runs growth, searches and the last search, and writes the lens.
+
+    Each of the three is a job of the run, whose result is stored: a run that is resumed continues
+    with the next one.
+    """
     start = config.load()
     start = design.open_apertures(start) if config.floating else start
     model = not config.glasses.makers or start.dispersion.model is not None

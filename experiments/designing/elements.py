@@ -1,11 +1,11 @@
 """Add elements to a lens one by one: thin meniscuses at every surface, least squares from each.
 
-The lens is optimised; then each of the best lenses gets a thin meniscus at each of its surfaces,
-and least squares go down on both sides of it (`drt_jax.design.insertions`). The best lenses go on
-to the next element; the best of all gets real glasses, if makers are named. Writes the lenses as
-ADDED_RANK.yaml and designed.yaml, and results.json: `rows`, one for each different lens, with
-`elements`, `form` (signs of the powers of the elements, S for the stop), `merit`, `spots_um` of the
-fields, and `at`, `front`, `way` of the meniscus.
+The lens is optimised. Then a thin meniscus is inserted at each surface of each of the best lenses,
+and least squares descend in both directions from this saddle point (`drt_jax.design.insertions`).
+The best lenses continue with the next element; the best of all gets real glasses, if makers are
+given. Writes the lenses as ADDED_RANK.yaml and designed.yaml, and results.json: `rows`, one for
+each different lens, with `elements`, `form` (signs of the powers of the elements, S for the stop),
+`merit`, `spots_um` of the fields, and `at`, `front`, `way` of the meniscus.
 """
 
 import dataclasses
@@ -26,20 +26,20 @@ from .design import Config as Design, problem_of, snapped
 from .runs.folder import Run
 
 COLUMNS = ("merit",)
-_SAME = 0.01  # relative difference of the merits of one lens found twice
-_DRAWN = 6  # most lenses of the largest number of elements that are drawn
+_SAME = 0.01  # lenses whose merits differ relatively by less count as the same lens
+_DRAWN = 6  # largest number of lenses that are drawn, of those with most elements
 
 
 @dataclasses.dataclass(frozen=True)
 class Config:
     """Settings of the experiment; see configs/elements.yaml.
 
-    design: the lens and its problem as in experiments.design, without starts and growth; variables
-        and operands must not name surfaces, whose numbers change.
-    elements: how many are added.
-    keep: best lenses that get one element more.
-    thickness_mm: of a meniscus at the start, and its distance from the surface.
-    bend: change of its curvature at the start, relative to the largest of the lens.
+    design: the lens and its problem as in experiments.design, without starts and growth. Variables
+        and operands must not name surfaces, because the numbers of surfaces change.
+    elements: number of elements that are added.
+    keep: number of best lenses that get one more element.
+    thickness_mm: thickness of a meniscus at the start, and its distance from the surface.
+    bend: change of its curvature at the start, relative to the largest curvature of the lens.
     """
 
     design: Design
@@ -71,7 +71,7 @@ def form_of(lens: drt_jax.Lens, wavelength: float) -> str:
 
 
 class _Search:
-    """What the levels of a run share."""
+    """State that all numbers of elements share."""
 
     def __init__(self, config: Config, run: Run) -> None:
         self.config, self.folder = config, run.folder
@@ -108,7 +108,7 @@ class _Search:
         return [self.told("0_0", problem, best, {})]
 
     def level(self, added: int, before: list[dict[str, Any]]) -> list[dict[str, Any]]:
-        """Rows of all different lenses with one element more, the best first."""
+        """Rows of all different lenses with one more element, the best first."""
         config, found = self.config, list[design.Insertion]()
         given = None, config.thickness_mm, config.bend, config.design.trials
         for rank in range(len(before[: config.keep])):
@@ -157,7 +157,7 @@ def run(config: Config, run: Run) -> dict[str, Any]:
 
 
 def tables(results: dict[str, Any]) -> dict[str, str]:
-    """The best lens of each number of elements, and all forms of the last."""
+    """Tables of the best lens for each number of elements, and of all forms with most elements."""
     header = ["elements", "form", "merit, mm^2", "spots, um", "worst limit exceeded by", "lenses"]
     lines = []
     *rows, last = results["rows"]
@@ -178,7 +178,7 @@ def _cells(row: dict[str, Any]) -> list[Any]:
 
 
 def draw(results: dict[str, Any], figures: pathlib.Path) -> None:
-    """Draws the best lens of each number of elements, and the forms of the last."""
+    """Draws the best lens for each number of elements, and all forms with most elements."""
     *rows, last = results["rows"]
     groups = [own for own in _common.grouped(rows, "elements").values()]
     scene = Scene.degrees(results["fields_deg"], np.inf, results["wavelengths_um"][:1])

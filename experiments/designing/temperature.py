@@ -1,8 +1,8 @@
-"""What temperature does to a lens in mounts of several metals.
+"""Effect of temperature on a lens in mounts of several metals.
 
 The lens is focused at 20 C. Writes results.json: `rows` with `mount`, `celsius`, `focal_mm`,
-`shift_um` (by how much the sensor would have to move for the smallest spots), and `spots_um` of
-all fields as they are, and `refocused_um` after this move.
+`shift_um` (shift of the sensor that makes the spots smallest), `spots_um` of all fields without
+this shift, and `refocused_um` with it.
 """
 
 import dataclasses
@@ -20,13 +20,13 @@ from . import _command, _common, _plots
 from ._common import LensFile, Numbers, Wavelengths, not_empty, within
 from .runs.folder import Run
 
-# Moves of the sensor that find the focus, relative to its place.
+# Shifts of the sensor at which spots are computed to find the focus, relative to its position.
 _STEP = 1e-3
 
 
 @dataclasses.dataclass(frozen=True)
 class Mount:
-    """A metal between the elements. expansion: 1e-6/K."""
+    """A metal between the elements. expansion: coefficient of thermal expansion, 1e-6/K."""
 
     name: str
     expansion: Annotated[float, within(-100, 1000)]
@@ -36,11 +36,11 @@ class Mount:
 class Config(LensFile):
     """Settings of the experiment.
 
-    lens: all its glasses are of the table.
-    fields_deg: in degrees. distance_mm: of the object; .inf for infinity.
-    mounts: of all air spaces.
+    lens: a lens whose glasses are all in the table of glasses.
+    fields_deg: fields, degrees. distance_mm: distance of the object; .inf for infinity.
+    mounts: metals of the mount, each for all air spaces.
     celsius: temperatures.
-    order: order of the pupil rule that focuses.
+    order: order of the pupil rule for focusing.
     tolerance: relative error of the spots.
     """
 
@@ -55,8 +55,8 @@ class Config(LensFile):
 
 
 def focused(config: Config, lens: drt_jax.Lens, scene: Scene) -> drt_jax.Lens:
-    """The lens with the sensor where the mean square of all spots, a parabola over its place, is
-    smallest."""
+    """The lens with its sensor at the smallest mean square of all spots, which is a parabola in the
+    position of the sensor."""
     variables = design.Variables.from_lens(lens, ["sensor"])
     problem = design.Problem.from_variables(variables, ["spot"], scene, config.order)
     step = _STEP * lens.sensor / variables.scale
@@ -80,7 +80,7 @@ def row_of(config: Config, lens: drt_jax.Lens, mount: Mount, celsius: float) -> 
 
 
 def run(config: Config, run: Run) -> dict[str, Any]:
-    """Focuses the lens at 20 C, and takes it to all temperatures in all mounts."""
+    """Focuses the lens at 20 C, and computes it at all temperatures in all mounts."""
     scene = Scene.degrees(config.fields_deg, config.distance_mm, config.wavelengths_um)
     lens = focused(config, config.load(), scene)
     jobs = {}
@@ -102,7 +102,8 @@ def tables(results: dict[str, Any]) -> dict[str, str]:
 
 
 def draw(results: dict[str, Any], figures: pathlib.Path) -> None:
-    """Draws focus and spots of each mount over temperature; and of the first, refocused."""
+    """Draws focus and spots of each mount over temperature; for the first mount also refocused
+    spots."""
 
     def mean(row: dict[str, Any], key: str) -> float:
         return math.hypot(*row[key]) / math.sqrt(len(row[key]))

@@ -1,18 +1,22 @@
 """Tolerances of a lens: sensitivities, predictions, Monte Carlo.
 
 Every lens is compensated, by focus or focus and tilt. A spot is the root mean square over the
-fields of the RMS radius of all wavelengths about their centroid, um. Writes results.json: `rows`,
-one for each error, with its `kind`, `place`, `size`, the change of the spot at minus and plus this
-size as predicted from second derivatives (`predicted_um`) and as traced (`traced_um`, and
-`before_um` without compensation), and the
-`moves` and `predicted_moves` of the compensators, mm and radians; `scales`, one for each scale of
-all sizes, with the spots of Monte Carlo and of each order of prediction; `worst`, the spot with all
-errors at the limits where second derivatives predict the largest. A lens with a failed ray has no
-spot (null), and counts as the worst.
+fields of the RMS radius of all wavelengths about their centroid, um. Writes results.json:
+
+- `rows`, one for each error, with its `kind`, `place`, `size`, the change of the spot at minus and
+  plus this size as predicted from second derivatives (`predicted_um`) and as traced (`traced_um`,
+  and `before_um` without compensation), and the `moves` and `predicted_moves` of the compensators,
+  mm and radians;
+- `scales`, one for each scale of all sizes, with the spots of Monte Carlo and of each order of
+  prediction;
+- `worst`, the spot with all errors at those limits for which second derivatives predict the largest
+  spot.
+
+A lens with a failed ray has no spot (null), and counts as the worst.
 
 Orders of prediction, as functions of all errors: "first", q = spot^2 from its gradient; "rays",
 from the sum of squares with first derivatives of all rays; "second", from all second derivatives.
-Their means and percentiles are those of many draws, which cost nothing.
+Their means and percentiles are those of many draws, which take nearly no time.
 """
 
 import dataclasses
@@ -41,7 +45,7 @@ from .runs.folder import Run
 _ORDERS = get_args(Order)
 _SAMPLES = ("traced", *_ORDERS)
 _SHOWN, _BINS = 14, 60
-# Styles of _SAMPLES, whose lines may coincide: the truth broad and pale, a dotted one on top.
+# Styles of _SAMPLES, whose lines may coincide: wide and pale for traced lenses, dotted on top.
 _STYLES: tuple[dict[str, Any], ...] = (
     {"color": "black", "alpha": 0.35, "linewidth": 4},
     {"color": "C1", "linestyle": "--", "linewidth": 1.5},
@@ -61,16 +65,16 @@ class Config(LensFile):
     """Settings of the experiment; see configs/tolerance.yaml.
 
     tolerances: see drt_jax.design.
-    fields_deg: pairs x, y.
+    fields_deg: fields as pairs x, y, degrees.
     wavelengths_um, colour_weights: wavelengths and their weights; empty for equal weights.
-    compensator: adjusted in every lens.
+    compensator: what is adjusted in every lens.
     errors: "uniform" up to their sizes, or "normal" with half the sizes as standard deviation,
         truncated at the sizes.
-    scales: scales of all sizes.
-    count: lenses of Monte Carlo for each scale.
-    draws: draws of the predictions.
+    scales: factors of all sizes.
+    count: number of Monte Carlo lenses for each scale.
+    draws: number of draws of the predictions.
     limits_um: spots for which the yield is reported.
-    devices: that share the lenses of Monte Carlo, see docs/devices.md.
+    devices: number of devices for the Monte Carlo lenses, see docs/devices.md.
     """
 
     tolerances: Annotated[tuple[design.Tolerance, ...], not_empty]
@@ -93,7 +97,7 @@ class Study:
     """The lens of the settings, with its errors.
 
     perturbed: the lens and its errors.
-    problem: what evaluates it.
+    problem: problem that evaluates it.
     normal: True for normal errors.
     """
 
@@ -144,12 +148,12 @@ def derivatives(study: Study) -> dict[str, Any]:
 
 
 def _um(squares: Any) -> np.ndarray:
-    """Roots, in um, of squares in mm^2, of which negative ones count as 0."""
+    """Square roots, in um, of values in mm^2; negative values count as 0."""
     return 1e3 * np.sqrt(np.maximum(squares, 0))
 
 
 def _model(fields: list) -> design.Predicted:
-    """The model whose fields `derivatives` has listed."""
+    """The model from its fields as `derivatives` returns them."""
     *arrays, before = fields
     return design.Predicted(*map(jnp.asarray, arrays), before and _model(before))
 
@@ -181,7 +185,12 @@ def sensitivity(study: Study, predicted: design.Predicted) -> dict[str, Any]:
 
 
 def monte_carlo(study: Study, predicted: design.Predicted, scale: float) -> dict[str, Any]:
-    """Traced and predicted spots at one scale of the sizes."""
+    """Traced and predicted spots at one scale of the sizes.
+
+    `config.count` lenses are traced, after a first one that compiles. The predictions are evaluated
+    at `config.draws` other draws, with the same statistics: mean, percentiles, yields, histogram. A
+    normal distribution of q gives a further 90th percentile without draws.
+    """
     config = study.config
     perturbations = scale * study.draws(config.count, config.seed)
     begun = time.perf_counter()
@@ -218,7 +227,7 @@ def monte_carlo(study: Study, predicted: design.Predicted, scale: float) -> dict
         }
         if name != "traced":
             mean, deviation = predicted.moments(variances, name)
-            # Root sum of squares: the distribution of q taken as normal.
+            # Root sum of squares: q is assumed to be normally distributed.
             row[name]["rss_p90_um"] = float(_um(mean + 1.2815516 * deviation))
     return row
 
@@ -242,8 +251,8 @@ def main_scale(results: dict[str, Any]) -> dict[str, Any]:
 
 
 def merged(results: dict[str, Any]) -> list[dict]:
-    """The largest change of each kind and part, of x and y, minus and plus; largest first. A lens
-    without a spot changes by inf."""
+    """The largest change for each kind of error and part of the lens, over x and y, minus and plus;
+    the largest first. The change is inf for a lens without a spot."""
     found = []
     for (kind, place), some in _common.grouped(results["rows"], "kind", "place").items():
         changes = [

@@ -1,10 +1,10 @@
 """Re-optimise a zoom lens, or one that focuses, in all configurations of its file at once.
 
-The settings name what moves, with a value of its own in each configuration, and what all share.
-Writes the lens of each configuration, before and after, as YAML, and results.json: `rows` with
-`configuration`, `focal_mm`, `merit_start`, `merit_moved` (only what moves is optimised; of many
-starts `merit_starts`, the best of them), `merit_end`, and `spots_um` of start and end; with near
-objects also `magnification` and `breathing` of start and end.
+The settings name the moving variables, which have a value for each configuration, and the shared
+variables. Writes the lens of each configuration, before and after, as YAML, and results.json:
+`rows` with `configuration`, `focal_mm`, `merit_start`, `merit_moved` (after optimising the moving
+variables alone; with many starts `merit_starts`, of the best start), `merit_end`, and `spots_um` at
+start and end; for near objects also `magnification` and `breathing` at start and end.
 """
 
 import dataclasses
@@ -30,17 +30,18 @@ from ._searches import Starts
 from .runs.folder import Run
 
 COLUMNS = ("merit", "worst", "jacobians")
-# What is kept of many starts; a start is good whose spots are at most so many times the best.
+# Results of many starts that are written; a start is good if its spots are at most this many times
+# the best ones.
 _KEPT, _GOOD = ("count", "passed", "scores", "trials", "seconds", "compile_s"), (1.1, 1.5, 2.0)
 
 
 @dataclasses.dataclass(frozen=True)
 class Keep:
-    """A value that each configuration keeps.
+    """An operand whose value each configuration keeps.
 
-    kind: an operand without rays; the magnification of near objects alone.
-    per_cent: by how much its value may change.
-    values: one for each configuration; empty for those of the file.
+    kind: an operand that needs no rays; "magnification" is for near objects only.
+    per_cent: allowed change of its value.
+    values: one value for each configuration; empty for the values of the file.
     """
 
     kind: OperandName
@@ -52,16 +53,16 @@ class Keep:
 class Config:
     """Settings of the experiment.
 
-    lens: a `.zmx` or `.seq` file with several configurations; with its fields and wavelengths.
-    moving: variables of which each configuration has its own.
+    lens: a `.zmx` or `.seq` file with several configurations, fields and wavelengths.
+    moving: variables with a value for each configuration.
     shared: variables that all configurations share.
-    operands: of each configuration.
-    keep: what each configuration keeps of the file.
-    weights: of the squares of each configuration; empty for equal weights.
+    operands: operands of each configuration.
+    keep: operands whose value each configuration keeps.
+    weights: weights of the squares of each configuration; empty for equal weights.
     order: order of the pupil rule.
     tolerance: relative error of the spots.
-    trials: most trials of a search.
-    starts: more than one: searches from many starts, the best of which is finished.
+    trials: largest number of trials of a search.
+    starts: number of starts; if it is above 1, the best of the searches is continued.
     """
 
     lens: str = "configs/design/lenses/us5568323.zmx"
@@ -79,9 +80,12 @@ class Config:
 def problem_of(
     config: Config, system: System, vary: tuple[Vary, ...], number: int = 0
 ) -> design.Problem:
-    """The problem of one configuration. It keeps its f-number by a solve of its stop; what else it
-    keeps are limits about the values of the settings or at the start; no magnification of an object
-    at infinity. number: of the configuration, from 0."""
+    """The problem of one configuration.
+
+    A solve of its stop keeps the f-number. The values of `keep` become limits about the values of
+    the settings, or about those at the start; a magnification is left out for an object at
+    infinity. number: of the configuration, from 0.
+    """
     wave = float(system.wavelengths[system.primary])
     solve = design.Solve("f_number", distance=system.distance, wavelengths=(wave,))
     lens = design.open_apertures(system.lens)
@@ -111,7 +115,8 @@ def zoom_of(
 def searched(
     config: Config, zoom: design.Configurations, run: Run, job: str, vector: Any = None
 ) -> dict[str, Any]:
-    """The end of a search from a vector, or the start: its vector, merits, limit and time."""
+    """Result of a search from `vector`, or from the start if it is None: vector, merits, limit and
+    time."""
     begun = time.perf_counter()
     found = design.optimise(zoom, vector, max_steps=config.trials)
     run.log(job, 0, dict(zip(COLUMNS, found.history.T)))
@@ -127,7 +132,7 @@ def searched(
 
 
 def focusing(systems: list[System], lenses: Sequence[drt_jax.Lens]) -> design.Focusing:
-    """Magnification, and breathing where the largest field of the first configuration is imaged."""
+    """Magnification; and breathing at the image of the largest field of the first configuration."""
     scene, wave = systems[0].scene, systems[0].wavelengths[systems[0].primary]
     point = dataclasses.replace(scene.at(scene.field[-1]), wavelengths=jnp.array([wave]))
     point = dataclasses.replace(point, wavelength_weights=None)
@@ -136,7 +141,11 @@ def focusing(systems: list[System], lenses: Sequence[drt_jax.Lens]) -> design.Fo
 
 
 def run(config: Config, run: Run) -> dict[str, Any]:
-    """Optimises what moves, then all, and writes the lens of each configuration."""
+    """Optimises the moving variables, then all, and writes the lens of each configuration.
+
+    With many starts, the best of their searches replaces the search of the moving variables. Each
+    search is a job whose result is stored, so that a run can be resumed after it.
+    """
     first = drt_jax.load_system(config.lens, configuration=1)
     count = range(1, first.configurations + 1)
     systems = [drt_jax.load_system(config.lens, configuration=k) for k in count]
@@ -221,15 +230,16 @@ def tables(results: dict[str, Any]) -> dict[str, str]:
 
 
 def _sizes(results: dict[str, Any]) -> np.ndarray:
-    """RMS spots, um, of the starts that pass light, over all fields of all configurations, from
-    their scores, the smallest first."""
+    """RMS spots over all fields of all configurations, um, the smallest first, of the starts at
+    which rays pass. They follow from the scores."""
     count = sum(len(row["fields_deg"]) for row in results["rows"])
     scores = [score for score in results["starts"]["scores"] if score is not None]
     return 1e3 * np.sqrt(np.sort(scores) / count)
 
 
 def draw(results: dict[str, Any], figures: pathlib.Path) -> None:
-    """Draws start and end in all configurations, side by side at one scale, the sensors in line."""
+    """Draws start and end in all configurations, side by side at one scale, with the sensors
+    aligned."""
     panels = [(row, name) for row in results["rows"] for name in ("start", "designed")]
     lenses, scenes, waves = [], [], results["wavelengths_um"]
     for row, name in panels:

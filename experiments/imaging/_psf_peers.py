@@ -1,7 +1,7 @@
 """PSFs and transfer functions by waves of other programs; each program may be missing.
 
-A peer returns samples of the irradiance. A pixel collects the difference, across it, of a cubic
-spline through their running sum.
+A peer returns samples of the irradiance. They are integrated over pixels: the light of a pixel is
+the difference between its edges of a cubic spline through the cumulative sum of the samples.
 """
 
 import dataclasses
@@ -27,9 +27,9 @@ _UM = 1e3  # per mm
 
 @dataclasses.dataclass(frozen=True)
 class Shot:
-    """A kernel that all programs compute: of an object point at infinity.
+    """The kernel of an object point at infinity, which all programs compute.
 
-    field: angle along y, radians. waves: (W,), um; other programs take the first alone.
+    field: angle along y, radians. waves: (W,), um; other programs use only the first.
     pixel: side of a pixel, mm. size: side of the kernel, pixels.
     """
 
@@ -87,7 +87,7 @@ def pupil(
     shot: Shot, rule: BeamRule, count: int, centre: np.ndarray | None = None
 ) -> tuple[np.ndarray, float, np.ndarray]:
     """The input of prysm: the pupil function on a square grid of direction cosines, the step of the
-    grid, and the centre (2,) of the image, mm: by default that of the light."""
+    grid, and the centre (2,) of the image, mm. centre: None for the centroid of the light."""
     scene = checked_scene(shot.lens, dataclasses.replace(shot, waves=shot.waves[:1]).scene)
     beam = trace_beam(shot.lens, scene, rule)
     low, high = (np.asarray(a)[:, 0] for a in beam.directions_extent())
@@ -105,7 +105,8 @@ def pupil(
 
 
 def optiland(shot: Shot, samples: int) -> Callable:
-    """call() -> (size, size): Optiland's FFT PSF about the chief ray. samples: rays per side."""
+    """A function call() -> (size, size): Optiland's FFT PSF about the chief ray. samples: rays
+    along a side."""
     from optiland.psf import FFTPSF
 
     given, grid = shot.optiland(), 4 * samples
@@ -119,9 +120,12 @@ def optiland(shot: Shot, samples: int) -> Callable:
 
 
 def optiland_contrast(shot: Shot, samples: int, frequencies: Sequence[float]) -> Callable:
-    """call() -> (2, N): Optiland's FFT MTF, tangential and sagittal, by a cubic spline through its
-    frequencies (HuygensMTF takes 2 s for 64 rays along a side, 9 s for 128, and is off by 0.1).
-    samples: rays along a side. frequencies: (N,), cycles/mm."""
+    """A function call() -> (2, N): Optiland's FFT MTF, tangential and sagittal, by a cubic spline
+    through its frequencies. (HuygensMTF takes 2 s for 64 rays along a side, 9 s for 128, and has an
+    error of 0.1.)
+
+    samples: rays along a side. frequencies: (N,), cycles/mm.
+    """
     from optiland.mtf import FFTMTF
 
     optic, field, wavelength = shot.optiland()
@@ -135,25 +139,25 @@ def optiland_contrast(shot: Shot, samples: int, frequencies: Sequence[float]) ->
 
 
 def batoid(shot: Shot, samples: int) -> Callable:
-    """call() -> (psf, (dy, dx)): batoid's FFT PSF about the chief ray, and the steps of its
-    samples, mm. samples: rays along a side."""
+    """A function call() -> (psf, (dy, dx)): batoid's FFT PSF about the chief ray, and the steps of
+    its samples, mm. samples: rays along a side."""
     import batoid
     from batoid.analysis import fftPSF
 
     numbers = shot.numbers()
     variant = numbers.variants[0]
-    numbers.clear[numbers.stop] = numbers.semi  # rays of a square grid are cut by the stop
+    numbers.clear[numbers.stop] = numbers.semi  # the stop clips the rays of a square grid
     optic = _peers._batoid_optic(numbers, variant, numbers.index[:, 0])
     place, radius = variant.pupil
     at = batoid.CoordSys(origin=[0, 0, place])
-    # Its rays fill a little more than the paraxial pupil.
+    # The rays of batoid fill a little more than the paraxial pupil.
     known = {"pupilSize": 2.1 * radius, "backDist": place + 2 * radius + 10.0}
     known |= {"stopSurface": batoid.Interface(batoid.Plane(), coordSys=at)}
     known |= {"sphereRadius": sum(variant.gaps[numbers.stop :])}
     optic = batoid.CompoundOptic(
         optic.items, name="lens", inMedium=optic.inMedium, outMedium=optic.outMedium, **known
     )
-    # Its rays go towards -z, along the same lines for a field of the other sign.
+    # The rays of batoid run towards -z, along the same lines as ours for a field of the other sign.
     given = optic, 0.0, -numbers.field, numbers.wavelengths[0] / _UM, "gnomonic", samples
 
     def call() -> tuple[np.ndarray, tuple[float, float]]:
@@ -176,8 +180,10 @@ def contrast_of(
 
 
 def prysm(shot: Shot, pupil: np.ndarray, step: float, fine: int = 9) -> Callable:
-    """call() -> (size, size): prysm's matrix Fourier transform of a pupil function (N, N). step:
-    step of its direction cosines. fine: samples per side of a pixel."""
+    """A function call() -> (size, size): prysm's matrix Fourier transform of a pupil function.
+
+    pupil: (N, N). step: step of its direction cosines. fine: samples along the side of a pixel.
+    """
     from prysm.propagation import Wavefront
 
     # At a focal length of 1 mm a direction cosine is a position in mm.
@@ -187,7 +193,7 @@ def prysm(shot: Shot, pupil: np.ndarray, step: float, fine: int = 9) -> Callable
         wave = Wavefront(function, wavelength, step)
         return np.asarray(wave.focus_fixed_sampling(1.0, _UM * sample, samples).data)
 
-    # Prysm's scale, from the known sum over a pupil of ones, and the total light.
+    # The scale of prysm follows from the known sum over a pupil of ones; and the total light.
     unit = abs(amplitude(np.ones((across, across), complex), 1).item()) / across**2
     scale = (step * sample * _UM / (wavelength * unit)) ** 2 / np.sum(np.abs(pupil) ** 2)
 

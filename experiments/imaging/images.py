@@ -1,12 +1,14 @@
 """The image of a point by each model: run time, error and picture.
 
-Kernels by rays and by waves with rising numbers of cells, and Gaussian ones, for each lens and
-field. `error` is against the limit of the model: a histogram of very many rays, or waves with very
-many cells; `off` is against the limit of waves. Both are sums of absolute differences of all
-pixels, of the worst wavelength. Optiland's FFT PSF and prysm's matrix Fourier transform are
-compared with the limit of waves at the middle wavelength; prysm traces no rays and gets our pupil.
-Writes results.json: `kernels` hold `lens`, `model`, `cells`, `value_s`, `gradient_s` (of a mean
-over the kernel, by every number of the lens), `error`, `off`; `peers`; `views`: the light outside
+Kernels by rays and by waves with increasing numbers of cells, and Gaussian kernels, are computed
+for each lens and field. `error` is the difference from the limit of the model: a histogram of very
+many rays, or waves with very many cells. `off` is the difference from the limit of waves. Both are
+sums of absolute differences over all pixels, for the worst wavelength. Optiland's FFT PSF and
+prysm's matrix Fourier transform are compared with the limit of waves at the middle wavelength;
+prysm traces no rays and gets our pupil function.
+
+Writes results.json: `kernels` have `lens`, `model`, `cells`, `value_s`, `gradient_s` (of a weighted
+sum of the kernel, by every number of the lens), `error`, `off`; `peers`; `views`: the light outside
 of the kernel, the noise of the histogram, the rays that arrive, seconds of 9 x 9 fields, MTF and
 its limit; `photographs`, in figures.
 """
@@ -37,7 +39,7 @@ from ._psf_peers import Shot
 from .runs.folder import Run
 
 MODELS = "gaussian", "rays", "waves"
-# Rays traced at once for a histogram.
+# Number of rays traced at a time for a histogram.
 _ROUND = 2**17
 
 
@@ -51,7 +53,7 @@ class Photo:
 
 @dataclasses.dataclass(frozen=True)
 class View(Photo):
-    """With a field angle along y."""
+    """A lens, its pixels, and a field angle along y."""
 
     field_deg: Annotated[float, within(0, 89.9)]
 
@@ -75,7 +77,7 @@ class Config:
     size: side of a kernel, pixels.
     rays, waves: cells per side of the models' grids.
     limit: cells per side for the limit of waves.
-    rounds: rounds of 2^17 rays a wavelength for the histogram.
+    rounds: number of rounds of 2^17 rays per wavelength for the histogram.
     peers: samples per side of the peers' pupils.
     frequencies: number of frequencies of the MTF, up to the pixels' Nyquist frequency.
     photo_pixels: side of the photograph.
@@ -97,8 +99,8 @@ class Config:
 
 
 def histogram(shot: Shot, rounds: int, centre: np.ndarray) -> tuple[np.ndarray, float, int]:
-    """Histogram (W, size, size) of traced rays on pixels about `centre` (2,), mm, its noise (from
-    its two halves), and the smallest number of rays of a wavelength that arrive."""
+    """Histogram (W, size, size) of traced rays on pixels about `centre` (2,), mm; its noise, from
+    its two halves; and the smallest number, over the wavelengths, of rays that arrive."""
     edges = (np.arange(shot.size + 1) - shot.size / 2) * shot.pixel
     points = drt_jax.pupil.random_disc(_ROUND * rounds, 0)[0]
     halves = np.zeros((2, len(shot.waves), shot.size, shot.size))
@@ -144,13 +146,13 @@ def measure(config: Config, view: View) -> dict[str, Any]:
 
 
 def _timed(shot: Shot, model: Sampling, repeats: int) -> tuple[np.ndarray, float, float]:
-    """A kernel, and seconds for it, alone and with the gradient of a weighted sum of it."""
+    """A kernel, and the seconds for it alone and for the gradient of a weighted sum of it."""
     weights = jnp.asarray(np.random.default_rng(0).normal(size=(shot.size, shot.size)))
 
     def mean(lens: Lens) -> jax.Array:
         return jnp.sum(weights[None] * shot.kernel(lens, model))
 
-    options = known_options(LARGE)  # as psf has them itself
+    options = known_options(LARGE)  # the options that psf uses
     functions = partial(shot.kernel, model=model), jax.value_and_grad(mean)
     programs = (jax.jit(function, compiler_options=options) for function in functions)
     value, gradient = (_work.compiled(program, shot.lens)[0] for program in programs)
@@ -168,7 +170,8 @@ def field_grid(shot: Shot, repeats: int) -> float:
 
 
 def contrast(config: Config, lens: Lens, field: float, pixel: float) -> tuple[list, list]:
-    """Frequencies up to Nyquist's, and the MTF by waves and by rays and its limit, (3, 2, N)."""
+    """Frequencies up to that of Nyquist; and the MTF by waves, by rays, and its diffraction limit,
+    (3, 2, N)."""
     lines = np.linspace(0, 0.5 / pixel, config.frequencies)
     scene = Scene.point(field, wavelengths=np.array(config.wavelengths_um))
     by_waves, by_rays = (drt_jax.transfer(lens, scene, lines, model) for model in ("waves", "rays"))
@@ -237,7 +240,7 @@ def photograph(config: Config, view: Photo, figures: pathlib.Path) -> dict[str, 
 
 
 def run(config: Config, run: Run) -> dict[str, Any]:
-    """Measures the views, then takes the photographs."""
+    """Measures the views, then renders the photographs."""
     jobs = {f"{v.lens} {v.field_deg:g}": partial(measure, config, v) for v in config.views}
     taken = {f"photo {v.lens}": v for v in config.photographs}
     jobs |= {name: partial(photograph, config, v, run.figures) for name, v in taken.items()}
@@ -319,7 +322,8 @@ def draw(results: dict[str, Any], figures: pathlib.Path) -> None:
 
 
 def _draw_gallery(results: dict[str, Any], path: pathlib.Path) -> None:
-    """Draws fields down and distances across, with the three models of each."""
+    """Draws kernels, with a row for each field and columns for the distances, each with three
+    models."""
     kernels, points = results["gallery_kernels"], results["gallery"]
     distances, fields, models = kernels.shape[:3]
     across = distances * models

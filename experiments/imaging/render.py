@@ -1,8 +1,8 @@
 """The photograph that a lens takes: `python -m experiments.render photo.jpg --set scene.lens=...`.
 
-The photograph stands for the image of a pinhole camera with the lens's focal length, pixel for
-pixel of the sensor. Its values are linearised by the curve of sRGB, and those of the result encoded
-again. Beyond its border the photograph continues as at its edge. Writes ideal.png and photo.png, of
+The photograph is used as the image of a pinhole camera with the lens's focal length; its pixels are
+those of the sensor. Its values are linearised by the curve of sRGB, which also encodes the result.
+Beyond its border the photograph is extended by its edge values. Writes ideal.png and photo.png, of
 the same size, and both side by side, into figures.
 """
 
@@ -30,7 +30,7 @@ from ._common import LensFile, odd, or_zero, three_colours, within
 from .runs.config import ConfigError
 from .runs.folder import Run
 
-# Bytes for each value of a picture: the picture, its light, the result and intermediate arrays.
+# Bytes for each value of a picture, for the picture, its light, the result and intermediate arrays.
 _BYTES = 40
 _positive = within(np.nextafter(0, 1), math.inf)
 _BEYOND = 1e-3  # fraction of light outside the kernels above which the table warns
@@ -59,12 +59,12 @@ class Scene(LensFile):
 class Config:
     """Settings of the experiment; see configs/render.yaml.
 
-    photo: a file, or "bundled".
+    photo: path of a file, or "bundled".
     pixel_um: side of a pixel; 0 to spread the photograph over `field_deg`.
     field_deg: field angle of the corners.
-    kernel: side of a kernel, pixels; 0 for what the blur needs.
-    nodes: fields on one side of the axis.
-    full_well, read_noise: electrons; a full well of 0 for no noise.
+    kernel: side of a kernel, pixels; 0 for the size that the blur needs.
+    nodes: number of fields on one side of the axis.
+    full_well, read_noise: of the sensor, electrons; a full well of 0 for no noise.
     """
 
     photo: str = "bundled"
@@ -81,14 +81,14 @@ class Config:
 
 
 def linear(pixels: np.ndarray) -> np.ndarray:
-    """Light of 8-bit values, by the curve of sRGB (IEC 61966-2-1): float32, 0 to 1."""
+    """Linear light of 8-bit values, by the curve of sRGB (IEC 61966-2-1): float32, 0 to 1."""
     level = np.arange(256) / 255
     curve = np.where(level <= 0.04045, level / 12.92, ((level + 0.055) / 1.055) ** 2.4)
     return curve.astype(np.float32)[pixels]
 
 
 def encoded(light: np.ndarray) -> np.ndarray:
-    """8-bit values of light, clipped to 0 to 1, by the curve of sRGB."""
+    """8-bit values of linear light, which is clipped to 0 to 1, by the curve of sRGB."""
     level = np.clip(light, 0, 1)
     curve = np.where(level <= 0.0031308, 12.92 * level, 1.055 * level ** (1 / 2.4) - 0.055)
     return np.round(255 * curve).astype(np.uint8)
@@ -129,7 +129,11 @@ def _distance(config: Config, shape: tuple[int, int]) -> Any:
 
 
 def run(config: Config, run: Run) -> dict[str, Any]:
-    """Renders the photograph."""
+    """Renders the photograph.
+
+    The side of a pixel is given, or follows from the focal length and the field in the corners.
+    `converge` chooses kernels and grid, `render` blurs the linear light, and noise is added last.
+    """
     pixels = _read("photo", config.photo)
     shape = pixels.shape[:2]
     lens = config.scene.load()

@@ -22,18 +22,18 @@ from ._common import Colours, require, within
 from .runs.config import ConfigError
 
 # Kinds of trained numbers. Tilts and decentres would break the symmetry of the pupil rule;
-# semi-diameters would shrink to 0, because the loss does not depend on the light.
+# semi-diameters would shrink to 0, because the loss does not depend on the throughput.
 KINDS = ("sensor", "curvature", "conic", "coefficients", "thickness")
 _RINGS = 4  # rings of rays in `Trained.scale`
 
 
 @dataclasses.dataclass(frozen=True)
 class Scene:
-    """The lens and what it photographs.
+    """The lens and the scene that it photographs.
 
     lens: bundled name or YAML path.
     wavelengths_um: wavelengths of the channels R, G, B.
-    tolerance: relative error of the blur, which fixes the number of rays.
+    tolerance: relative error of the blur, which determines the number of rays.
     field: angle of the object along y, or (x, y), degrees.
     """
 
@@ -53,7 +53,7 @@ class Scene:
 
 
 def variable_names(names: tuple[str, ...]) -> str:
-    """Variables, each a kind, or a kind and the number of a surface."""
+    """Variables: each is a kind, or a kind and the number of a surface."""
     for name in names:
         kind, _, row = name.partition(" ")
         if kind not in KINDS:
@@ -84,8 +84,8 @@ class Trained:
 
     @classmethod
     def of(cls, name: str, variables: tuple[str, ...]) -> "Trained":
-        """From a lens by name or path, and `train.variables`. ConfigError for a surface that the
-        lens does not have."""
+        """Makes it from the name or path of a lens, and `train.variables`. ConfigError for a
+        surface that the lens does not have."""
         lens, moves = drt_jax.load_lens(name), "sensor" in variables
         parts = [name.partition(" ") for name in variables if name != "sensor"]
         try:
@@ -100,7 +100,7 @@ class Trained:
         return () if self.variables is None else self.variables.names
 
     def start(self, sensor: Any) -> dict[str, Array]:
-        """Values of the lens at the start. sensor: (...), position of the sensor, mm."""
+        """Values of the trained numbers at the start. sensor: (...), position of the sensor, mm."""
         values = {"sensor": jnp.asarray(sensor)}
         if self.variables is not None:
             for name, number in zip(self.names, self.variables.start):
@@ -108,7 +108,8 @@ class Trained:
         return values
 
     def lens_of(self, values: Mapping[str, Any]) -> drt_jax.Lens:
-        """The lens for values. The sensor is where `values` say, whatever the thicknesses are."""
+        """The lens for values. The position of the sensor is that in `values`, independent of the
+        thicknesses."""
         lens, dtype = self.lens, self.lens.curvature.dtype
         if self.variables is not None:
             numbers = [jnp.asarray(values[name], dtype) for name in self.names]
@@ -133,11 +134,12 @@ class Trained:
         """Change of each number, by name and in the unit of the lens, that is equivalent to 1 mm of
         the sensor; 0 for a sensor that is not trained.
 
-        It changes the ray deviations from the centroid as much as 1 mm of the sensor does (root
-        mean square over pupil and wavelengths, to first order, at the start). So one rate in mm
-        suits all units, and no number changes the focus faster than the sensor. The change is at
-        most as many typical steps of a design as 1 mm of the sensor is; without this bound the
-        conic of a nearly flat surface would change by thousands.
+        Both change the deviations of the rays from the centroid by the same amount (root mean
+        square over pupil and wavelengths, to first order, at the start). One rate in mm is
+        therefore suitable for numbers of all units, and no number changes the focus faster than the
+        sensor does. In units of the typical step of a design, the change is at most that of 1 mm of
+        the sensor; without this bound the conic of a nearly flat surface would change by
+        thousands.
         """
         pupil = tuple(jnp.asarray(hexapolar(_RINGS)[0].T, self.lens.curvature.dtype))
 

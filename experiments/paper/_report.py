@@ -1,4 +1,4 @@
-"""Tables and figures of the paper's experiments, from their results alone."""
+"""Tables and figures of the paper's experiments, made from results.json alone."""
 
 import pathlib
 from typing import Any
@@ -12,7 +12,7 @@ from . import _plots
 from ._common import number, table
 from ._optics import Trained
 
-# Images of patches, in the order of an imager.
+# Images of patches, in the order in which an imager returns them.
 IMAGES = ("truth", "sensor", "restored")
 _ERROR = f"error x {_plots.GAIN}"
 _UNITS = {"sensor": "mm", "thickness": "mm", "curvature": "1/mm"}
@@ -31,7 +31,7 @@ def start_lines(results: dict[str, Any], column: str, batches: int | None = None
 
 
 def reached(results: dict[str, Any]) -> str:
-    """Planes at which the starts ended, as text."""
+    """Final sensor positions of the starts, as text."""
     if None in results["final_mm"]:
         return "not finite"
     low, high = (f"{end(results['final_mm']):.3f}" for end in (min, max))
@@ -46,12 +46,13 @@ def moves(results: dict[str, Any]) -> bool:
 def tables(
     name: str, results: dict[str, Any], plane: str, rows: list[tuple[str, str, str]], more: str = ""
 ) -> dict[str, str]:
-    """The table `name` of what the paper says and what was found here, without the paper if it has
-    no such numbers; and a table of the trained numbers, if more than the sensor is trained.
+    """The table `name`, which compares the paper with the results here, or has only these if the
+    paper has no numbers for the settings; and a table of the trained numbers, if more than the
+    sensor is trained.
 
-    plane: where all starts end in the paper.
-    rows: what, in the paper, here.
-    more: further words on where they end here.
+    plane: final sensor position of all starts in the paper.
+    rows: quantity, value in the paper, value here.
+    more: text that is added to the final sensor positions here.
     """
     if "numbers" not in results:
         rows = [("plane that all starts reach", plane, reached(results) + more), *rows]
@@ -92,8 +93,8 @@ def draw_sensor(results: dict[str, Any], path: pathlib.Path) -> None:
 
 
 def draw_numbers(results: dict[str, Any], folder: pathlib.Path) -> None:
-    """Figures numbers.png, of the trained numbers, and designed.png, of the lens of the first start
-    before and after; none if only the sensor is trained."""
+    """Draws numbers.png, the trained numbers, and designed.png, the lens of the first start before
+    and after training. Draws nothing if only the sensor is trained."""
     if "numbers" not in results:
         return
     trained = Trained.of(results["lens"], tuple(results["variables"]))
@@ -123,8 +124,8 @@ def draw_lens(results: dict[str, Any], distance: float, path: pathlib.Path) -> N
 
 
 def draw_patches(results: dict[str, Any], titles: list[str], path: pathlib.Path) -> None:
-    """Figure of the `images` of patches, with the RMSE of all but the truth, and of the errors
-    that are left."""
+    """Figure of the `images` of patches, with the RMSE of all except the true images; and of the
+    remaining errors."""
     truth, sensor, restored = (np.float32(results[name]) for name in IMAGES)
     rows = {"sensor": sensor, "restored": restored}
     _plots.patch_grid(path, titles, truth, rows, {_ERROR: restored})

@@ -14,13 +14,15 @@ from ._sharing import require_shared
 
 @dataclasses.dataclass(frozen=True)
 class Training:
-    """Length and speed of training.
+    """Length and rates of training.
 
-    batches: steps of each job.
+    batches: number of steps of each job.
     patch: side of a patch, pixels.
     variables: trained numbers of the lens, by kind, or kind and surface such as "curvature 0".
-    optics_rate: Adam's learning rate of the sensor, mm; other rates follow from `Trained.scale`.
-    checkpoint_every: batches between checkpoints, rounded up to reports of metrics.
+    optics_rate: Adam's learning rate of the sensor, mm; the rates of other numbers follow from
+        `Trained.scale`.
+    checkpoint_every: number of batches between checkpoints, rounded up to the next report of
+        metrics.
     """
 
     batches: Annotated[int, within(1, math.inf)]
@@ -84,7 +86,8 @@ class JointSettings(Settings):
     """Settings with a network.
 
     test_patches: number of test patches; 0 for all.
-    devices: that share each batch, see docs/devices.md; another number goes on with the same run.
+    devices: number of devices for each batch, see docs/devices.md; a run can be resumed with
+        another number.
     """
 
     train: JointTraining

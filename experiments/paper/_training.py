@@ -1,4 +1,4 @@
-"""Training jobs of the paper's experiments, and the patches of images that they take."""
+"""Training jobs of the paper's experiments, and the patches of images for them."""
 
 import dataclasses
 import functools
@@ -34,7 +34,7 @@ from .runs.interrupt import deferred_interrupt
 
 # Tolerance of wave kernels, the sum of absolute errors of their pixels.
 _KERNELS = 0.05
-# Most skipped files named on the terminal; the run folder names all.
+# Largest number of skipped files that are listed on the terminal; the run folder has all.
 _NAMED = 20
 
 
@@ -42,9 +42,9 @@ _NAMED = 20
 class Loop:
     """The loop of training of one job.
 
-    steps: numbers of the steps, behind those of the last checkpoint.
-    checkpoint_every: steps between checkpoints, rounded up to reports.
-    mesh: devices that share a batch; None for one.
+    steps: numbers of the steps, from the last checkpoint on.
+    checkpoint_every: number of steps between checkpoints, rounded up to the next report.
+    mesh: devices among which a batch is divided; None for one device.
     """
 
     run: Run
@@ -56,8 +56,9 @@ class Loop:
     def train(
         self, step: Callable, state: Any, scenes: Iterator[np.ndarray], noise: float, log: Callable
     ) -> Any:
-        """Trains with a bar and checkpoints, and returns the last state. KeyboardInterrupt, after a
-        checkpoint, if the user stops it. log: called with what `train.fit` reports."""
+        """Trains with a progress bar and checkpoints, and returns the last state.
+        KeyboardInterrupt, after a checkpoint, if the user stops it. log: called with each report of
+        `train.fit`."""
         saved, total = self.steps.start, self.steps.stop
         bar = tqdm(total=total, initial=saved, desc=self.job, unit="batch", dynamic_ncols=True)
 
@@ -75,7 +76,7 @@ class Loop:
             print("\nstopping after this step; once more stops at once", file=sys.stderr)
 
         stream = (split(self.mesh, some) for some in scenes)
-        # Each report waits for the device: seldom where a step takes milliseconds.
+        # Each report waits for the device. Reports are rare if a step takes milliseconds.
         every = 10 if jax.default_backend() == "cpu" else 113
         with bar, deferred_interrupt(stopping) as asked:
             state = copied(self.mesh, state)
@@ -96,7 +97,8 @@ class Jobs:
     """
 
     def __init__(self, run: Run, config: Settings, near: float, far: float, *more: float) -> None:
-        """near, far: distances in training, mm. more: other distances of tests, mm."""
+        """near, far: nearest and farthest object in training, mm. more: other distances of tests,
+        mm."""
         self._run, self._config, self._depths = run, config, (near, far)
         self.lens = Trained.of(config.scene.lens, config.train.variables)
         self.blur = self.lens.blur(config.scene, min([near, *more]), max([far, *more]))
@@ -124,7 +126,7 @@ class Jobs:
     def steps(
         self, blur: Callable, several: bool = False, convolve: Callable = convolve
     ) -> tuple[Callable, tuple[Callable, Callable]]:
-        """The imager of a blur and its (init, step), for one job, or several at once."""
+        """The imager of a blur and its (init, step), for one job or for several jobs at once."""
         config = self._config
         both = self.restore, shared(self.restore, self._mesh, 1)
         plain, spread = (train.make_imager(blur, net, config.camera, convolve) for net in both)
@@ -143,10 +145,11 @@ class Jobs:
         noise: float,
         labels: tuple[str, ...] = (),
     ) -> dict[str, Any]:
-        """Trains one job, or several at once with a label each, from the last checkpoint on, and
-        returns the trained parameters. KeyboardInterrupt, after a checkpoint, if the user stops it.
+        """Trains one job, or several jobs at once with a label for each, from the last checkpoint
+        on, and returns the trained parameters. KeyboardInterrupt, after a checkpoint, if the user
+        stops it.
 
-        steps: from `steps`.
+        steps: result of `steps`.
         optics: parameters of the optics at the start.
         noise: standard deviation of the noise.
         """
@@ -172,8 +175,8 @@ class Jobs:
     def _check(
         self, label: str, first: int, rows: dict[str, np.ndarray], values: dict[str, float]
     ) -> None:
-        """ConfigError for numbers that are not finite and for surfaces that cross, after saving the
-        lens of the last valid report."""
+        """ConfigError for numbers that are not finite and for surfaces that cross. The lens of the
+        last valid report is saved before."""
         try:
             require_finite(label, first, rows["loss"])
             require_finite(label, first, rows["sigma_um"], "blur")
@@ -216,8 +219,8 @@ class Jobs:
         }
 
     def _gaussian(self) -> list[dict[str, float]]:
-        """Error of the Gaussian kernels of the first start's lens against waves, for the nearest
-        and the farthest object; [] where wave kernels do not converge."""
+        """Error of Gaussian kernels, compared with waves, for the lens of the first start and the
+        nearest and the farthest object; [] if wave kernels do not converge."""
         config, camera = self._config, self._config.camera
         lens = self.lens.lens_of(self._good[start_label(config.starts_mm[0])])
         distances = sorted(set(self._depths))
@@ -263,8 +266,8 @@ def require_finite(label: str, first: int, losses: np.ndarray, what: str = "loss
 
 
 def read_patches(config: DataConfig, side: int, seed: int, folder: pathlib.Path) -> Patches:
-    """Patches of images, with a bar. Prints how many there are and which files were skipped; a long
-    list goes into skipped.txt of the folder."""
+    """Reads patches of images, with a progress bar. Prints their number and the files that were
+    skipped; a long list is written to skipped.txt of the folder."""
     reading = functools.partial(tqdm, desc="reading images", leave=False)
     patches = load_patches(config, side, seed, reading)
     for line in patches.skipped[:_NAMED]:
@@ -281,8 +284,8 @@ def read_patches(config: DataConfig, side: int, seed: int, folder: pathlib.Path)
 def images(
     imager: Callable, parameters: Any, scenes: np.ndarray, where: Any, noise: float, seed: int
 ) -> dict[str, np.ndarray]:
-    """True, sensor and restored images of patches, for `draw_patches`. where: the distance, or
-    the object points, that `imager` takes."""
+    """True, sensor and restored images of patches, for `draw_patches`. where: argument of `imager`,
+    the distance or the object points."""
     found = imager(parameters, scenes, where, np.float32(noise), jax.random.key(seed))
     return {name: np.asarray(image, np.float16) for name, image in zip(IMAGES, found)}
 

@@ -1,12 +1,12 @@
 """Section 6.3 of the paper: extended depth of field with a chromatic lens and a network.
 
-The object distance is random in each batch. Every starting position of the sensor is trained
-jointly with its network; one start also with the sensor fixed, for comparison. The loop traces no
-ray: the moments are interpolated in 1/distance. Draws the lens and figures 6a, 6b and 7, and
-writes table 2.
+The object distance is random in each batch. Each starting position of the sensor is trained jointly
+with a network; for comparison one start is also trained with the sensor fixed. If only the sensor
+is trained, the loop traces no rays, because the moments are interpolated in 1/distance. Draws the
+lens and figures 6a, 6b and 7, and writes table 2.
 
-train.variables: sensor, curvature, conic, coefficients, thickness, each of all surfaces or, as in
-"curvature 0", of one. scene.field: degrees along y, or [x, y].
+train.variables: sensor, curvature, conic, coefficients, thickness; for all surfaces or, as in
+"curvature 0", for one. scene.field: degrees along y, or [x, y].
 """
 
 import dataclasses
@@ -33,7 +33,7 @@ _Depths = Annotated[Numbers, within(1e-3, 1e9)]
 class Config(_settings.JointSettings):
     """Settings of the experiment; see configs/edof.yaml.
 
-    fixed_mm: one of starts_mm, also trained with the sensor fixed.
+    fixed_mm: the one of starts_mm that is also trained with the sensor fixed.
     depth_m: nearest and farthest object in training.
     table_depth_m, patch_depth_m: distances of table 2 and figure 7.
     """

@@ -1,10 +1,11 @@
 """Section 6.1 of the paper: focus a lens by gradient descent through the sensor layer alone.
 
-Several starting positions of the sensor are trained together, without a network. The loop traces
-no ray: the moments are polynomials in the sensor position. Draws the lens and figures 4a and 4b.
+Several starting positions of the sensor are trained together, without a network. If only the
+sensor is trained, the loop traces no rays, because the moments are polynomials in the sensor
+position. Draws the lens and figures 4a and 4b.
 
-train.variables: sensor, curvature, conic, coefficients, thickness, each of all surfaces or, as in
-"curvature 0", of one. scene.field: degrees along y, or [x, y].
+train.variables: sensor, curvature, conic, coefficients, thickness; for all surfaces or, as in
+"curvature 0", for one. scene.field: degrees along y, or [x, y].
 """
 
 import dataclasses
@@ -36,16 +37,16 @@ class Config(_settings.Settings):
 
 
 def best_focus(loss: Callable, scenes: np.ndarray, low: float, high: float) -> float:
-    """Sensor position of the smallest `loss` (sensor, scenes) between `low` and `high`, mm, to a
-    ten thousandth of the interval, by four dense searches. NaN without a minimum inside: if an end
-    is smallest up to rounding, or the loss is not finite somewhere."""
+    """Sensor position of the smallest `loss` (sensor, scenes) between `low` and `high`, mm, by four
+    dense searches, with an error of a ten thousandth of the interval. NaN if there is no minimum
+    inside: if the loss is smallest at an end, up to rounding, or is not finite somewhere."""
     losses = jax.jit(lambda grid, scenes: jax.lax.map(lambda s: loss(s, scenes), grid))
     batch = min(32, len(scenes))
     parts = [scenes[i : i + batch] for i in range(0, len(scenes) - batch + 1, batch)]
     for turn in range(4):
         grid = np.linspace(low, high, 41)
         found = sum(np.asarray(losses(jnp.asarray(grid), part), float) for part in parts)
-        k = np.argmin(found)  # that of a NaN if there is one
+        k = np.argmin(found)  # the index of a NaN if there is one
         if not turn and not found[k] < (1 - _ROUNDING) * np.min(found[[0, -1]]):
             return math.nan
         best, low, high = grid[k], grid[max(k - 2, 0)], grid[min(k + 2, 40)]
@@ -61,7 +62,7 @@ def run(config: Config, run: Run) -> dict[str, Any]:
     starts = jobs.lens.start(config.starts_mm)
     jobs.train("all starts", steps, starts, config.noise, labels)
     results = jobs.results("sensor_mm", "sigma_um") | {"distance_mm": distance}
-    if jobs.lens.names:  # a lens that changes has no best focus
+    if jobs.lens.names:  # the best focus is that of a fixed lens
         return results
 
     def loss(sensor, scenes):

@@ -1,10 +1,10 @@
 """Section 6.2 of the paper: focus a lens and train a restoration network, jointly.
 
-Each starting position of the sensor trains its own network; the table of noise levels trains one
+A network is trained for each starting position of the sensor, and for the table of noise levels one
 more for each level. Draws figure 5a and restored patches, and writes table 5b.
 
-train.variables: sensor, curvature, conic, coefficients, thickness, each of all surfaces or, as in
-"curvature 0", of one. scene.field: degrees along y, or [x, y].
+train.variables: sensor, curvature, conic, coefficients, thickness; for all surfaces or, as in
+"curvature 0", for one. scene.field: degrees along y, or [x, y].
 """
 
 import dataclasses
@@ -25,7 +25,7 @@ COLUMNS = ("loss", "sensor_mm", "sigma_um")
 class Config(_settings.JointSettings):
     """Settings of the experiment; see configs/restore.yaml.
 
-    table_starts_mm: starts that are trained at each noise of table_noise.
+    table_starts_mm: starts that are trained at each noise level of table_noise.
     """
 
     table_starts_mm: Annotated[Numbers, within(1e-3, 1e6)]

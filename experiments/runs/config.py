@@ -16,7 +16,7 @@ from drt_jax.inputs import InputError, parse, read_yaml, shown
 
 T = TypeVar("T")
 Source = Callable[[str], str]
-# Limits: whole numbers, size of other finite numbers, items of a list, characters of a text.
+# Limits: whole numbers, magnitude of other finite numbers, items of a list, characters of a text.
 _MOST, _LARGEST, _ITEMS, _LONGEST = 2**31 - 1, 1e12, 1000, 1000
 _NAMES = {float: "a number", int: "a whole number", bool: "true or false", str: "text"}
 _NAMES[type(None)] = "null"
@@ -29,8 +29,8 @@ class ConfigError(InputError):
 def load_config(cls: type[T], path: str | pathlib.Path, overrides: Sequence[str] = ()) -> T:
     """Reads a YAML file into a dataclass.
 
-    cls: the dataclass; keys that the file does not have keep its defaults.
-    overrides: such as "train.batch=8", applied afterwards, all at once.
+    cls: the dataclass; keys that are not in the file have its defaults.
+    overrides: such as "train.batch=8"; all are applied together, after the file.
 
     ConfigError, with the line, for a file that cannot be read, an unknown key (with the nearest
     known one) or a value of a wrong type or size.
@@ -57,7 +57,7 @@ def load_config(cls: type[T], path: str | pathlib.Path, overrides: Sequence[str]
         entry = _merged(entry, value)
 
     def source(key: str) -> str:
-        """The last override of a key, or of one that holds it; else all of them."""
+        """The last override of a key, or of a key that contains it; else all overrides."""
         own = [name for given, name in names.items() if f"{key}.".startswith(f"{given}.")]
         return own[-1] if own else " ".join(names.values())
 
@@ -74,8 +74,8 @@ def _merged(old: object, new: object) -> object:
 def _build(cls: Any, entry: object, source: Source, prefix: str = "") -> Any:
     """The dataclass `cls` with the values of `entry`, and defaults for the others.
 
-    source: source of the setting of a key, in messages.
-    prefix: the keys that lead here, each followed by a dot.
+    source: function of a key that returns where it was set, for messages.
+    prefix: keys of the enclosing mappings, each followed by a dot.
     """
     here = prefix.rstrip(".")
     if not isinstance(entry, dict):
@@ -110,9 +110,14 @@ def _error(source: Source, key: str, message: str) -> ConfigError:
 
 
 def _convert(kind: Any, value: object, source: Source, key: str) -> Any:
-    """`value` as `kind`: a dataclass, bool, int, float, str, tuple[X, ...], X | tuple[X, ...],
-    X | None or a Literal; or Annotated[X, check, ...] with functions that return what is wrong with
-    a value, "" for nothing."""
+    """`value` converted to the type `kind`.
+
+    kind: a dataclass, bool, int, float, str, tuple[X, ...], X | tuple[X, ...], X | None or a
+        Literal; or Annotated[X, check, ...], where each check is a function of the value that
+        returns the text of an error, "" for none.
+
+    Sizes are limited for all values. YAML 1.1 reads 1e-3 as text, so text is accepted for numbers.
+    """
     if dataclasses.is_dataclass(kind):
         return _build(kind, value, source, f"{key}.")
     origin, arguments = typing.get_origin(kind), typing.get_args(kind)
@@ -123,7 +128,7 @@ def _convert(kind: Any, value: object, source: Source, key: str) -> Any:
                 raise _error(source, key, f"{key}: {wrong}")
         return found
     limit = ""
-    if origin in (types.UnionType, typing.Union):  # of one value, and of a list or nothing
+    if origin in (types.UnionType, typing.Union):  # X | tuple[X, ...], or X | None
         if value is None and arguments[1] is type(None):
             return None
         listed = isinstance(value, list | tuple) and arguments[1] is not type(None)
@@ -155,7 +160,7 @@ def _convert(kind: Any, value: object, source: Source, key: str) -> Any:
 
 
 def _number(value: int | float | str) -> float:
-    """The number; NaN for what is none, and for a finite one too large for a float."""
+    """The value as a number; NaN if it is not one, or is finite but too large for a float."""
     try:
         number = float(value)
     except (ValueError, OverflowError):
@@ -176,7 +181,7 @@ def _say(kind: Any) -> str:
 
 
 def describe(cls: Any, prefix: str = "") -> list[str]:
-    """Lines "key: type" of the settings, for --help."""
+    """The settings as lines "key: type", for --help."""
     lines = []
     for name, kind in typing.get_type_hints(cls).items():
         if dataclasses.is_dataclass(kind):

@@ -1,5 +1,4 @@
-"""What a run keeps on disk: files that are written whole or not at all, arrays with a checksum, and
-a folder in which one process works at a time."""
+"""Files of a run: atomic replacement of files, arrays with a checksum, and the lock of a folder."""
 
 import contextlib
 import hashlib
@@ -23,13 +22,14 @@ _SCRATCH = ".drt_jax.partial"
 
 
 def replace(path: pathlib.Path, content: bytes) -> None:
-    """Writes a file in one step: at every moment there is the old one (or none) or the new one.
+    """Replaces a file atomically: at every moment it has the old content (or does not exist) or the
+    new content.
 
     path: path of the file; its folder is created.
-    content: the whole content.
+    content: the new content.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
-    scratch = path.with_name(secrets.token_hex(8) + _SCRATCH)  # of this call alone
+    scratch = path.with_name(secrets.token_hex(8) + _SCRATCH)  # a name for this call alone
     try:
         with open(scratch, "xb") as file:
             file.write(content)
@@ -41,13 +41,16 @@ def replace(path: pathlib.Path, content: bytes) -> None:
 
 
 def sweep(folder: pathlib.Path) -> None:
-    """Removes what a process killed in `replace` left in a folder."""
+    """Removes temporary files of processes that were killed in `replace`."""
     for scratch in folder.glob("*" + _SCRATCH):
         scratch.unlink(missing_ok=True)
 
 
 def packed(about: dict[str, Any], leaves: Sequence[np.ndarray]) -> bytes:
-    """A file that holds arrays and, as JSON, what they are: an .npz with a checksum of both."""
+    """Arrays and their description as the content of an .npz file, with a checksum of both.
+
+    about: description, written as JSON. leaves: the arrays.
+    """
     text, file = json.dumps(about), io.BytesIO()
     entries: dict[str, Any] = {f"leaf{i}": leaf for i, leaf in enumerate(leaves)}
     np.savez(file, about=np.array(text), checksum=np.array(_checksum(text, leaves)), **entries)
@@ -55,7 +58,8 @@ def packed(about: dict[str, Any], leaves: Sequence[np.ndarray]) -> bytes:
 
 
 def unpacked(content: bytes) -> tuple[dict[str, Any], list[np.ndarray]]:
-    """What `packed` was given. ValueError, with the reason, for other content and damaged one."""
+    """The arguments of `packed`. ValueError, with the reason, if the content is damaged or is not a
+    result of `packed`."""
     try:
         with np.load(io.BytesIO(content)) as saved:
             text, checksum = str(saved["about"]), str(saved["checksum"])
@@ -85,9 +89,9 @@ def _checksum(about: str, leaves: Sequence[np.ndarray]) -> str:
 def locked(folder: pathlib.Path) -> Iterator[None]:
     """Keeps other processes out of a folder.
 
-    The system unlocks it when the process ends, however it ends. Windows and some network file
-    systems have no such locks: nothing is locked there. ConfigError if another process has locked
-    the folder.
+    The operating system removes the lock when the process ends, also if it is killed. On Windows
+    and on some network file systems, which have no such locks, nothing is locked. ConfigError if
+    another process has locked the folder.
     """
     number = os.open(folder / "lock", os.O_RDWR | os.O_CREAT, 0o666)
     try:

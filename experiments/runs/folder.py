@@ -1,8 +1,8 @@
-"""The folder of a run: resolved config, metrics as they come, checkpoints, results, figures.
+"""The folder of a run: resolved config, metrics, checkpoints, results, figures.
 
-A run killed at any moment can resume: one process at a time works in the folder, a checkpoint
-replaces its predecessor in one step and is checked before use, and resuming drops metrics beyond
-the checkpoint.
+A run that was killed at any moment can be resumed: one process at a time works in the folder, a
+checkpoint replaces its predecessor atomically and is checked before use, and resuming drops metrics
+beyond the checkpoint.
 """
 
 import contextlib
@@ -40,8 +40,8 @@ def begun(folder: pathlib.Path) -> bool:
 
 
 class Run:
-    """One run in one folder, with one or more jobs, such as starting points. No other process may
-    open the folder until `close`, or the end of a `with` block.
+    """One run in one folder, with one or more jobs, such as starting points. No other process can
+    open the folder before `close`, or before the end of a `with` block.
 
     figures: folder of its figures.
     """
@@ -53,16 +53,16 @@ class Run:
         columns: columns of metrics.csv after `job` and `step`.
         resume: True to resume the run in the folder.
 
-        ConfigError if another process works in the folder or, without `resume`, if it holds a run;
-        with `resume` if it holds none, one with other settings, or damaged metrics.
+        ConfigError if another process works in the folder. Without `resume`: if it already contains
+        a run. With `resume`: if it contains no run, a run with other settings, or damaged metrics.
         """
         self.folder = folder
         self.figures = folder / "figures"
         self._metrics = Metrics(folder / "metrics.csv", columns)
         self._earlier, self._opened = 0.0, time.perf_counter()
-        self._saved: set[str] = set()  # the jobs with a checkpoint of this process
-        self._machines = [machine()]  # and those of the checkpoints that were read
-        # But for settings that say how a run is done, not what comes out.
+        self._saved: set[str] = set()  # jobs of which this process has written a checkpoint
+        self._machines = [machine()]  # also the machines of checkpoints that were read
+        # All settings except those that do not change the results.
         about = {f.name for f in dataclasses.fields(config) if f.compare}
         compared = {n: v for n, v in dataclasses.asdict(config).items() if n in about}
         settings = json.dumps(compared, sort_keys=True)
@@ -102,7 +102,7 @@ class Run:
 
     @property
     def seconds(self) -> float:
-        """Time spent on the run, with that before resumes, s."""
+        """Time spent on the run, s, with the time before it was resumed."""
         return self._earlier + time.perf_counter() - self._opened
 
     def log(self, job: str, step: int, rows: dict[str, np.ndarray]) -> None:
@@ -119,7 +119,7 @@ class Run:
 
     def save(self, job: str, step: int, tree: Any) -> None:
         """Writes a checkpoint: the state `tree` of a job after `step` logged steps. ConfigError if
-        it is not finite; the checkpoint before it stays."""
+        the state is not finite; the previous checkpoint is then kept."""
         leaves = [np.asarray(leaf) for leaf in jax.tree.leaves(tree)]
         if not finite(leaves):
             remedy = "lower the learning rates; the last checkpoint is of an earlier step"
@@ -148,19 +148,19 @@ class Run:
         return step, jax.tree.unflatten(structure, map(jnp.asarray, found))
 
     def keep(self, job: str, value: Any) -> None:
-        """Writes the checkpoint of a finished job: its result, which JSON can hold."""
+        """Writes the checkpoint of a finished job: its result, as JSON."""
         text = np.frombuffer(json.dumps(value).encode(), np.uint8)
         self.save(job, len(self.metrics(job)["step"]), text)
 
     def kept(self, job: str) -> Any:
-        """The result of a job from `keep`; without one None, and its metrics are dropped.
-        ConfigError as in `load`."""
+        """The result of a job that was written by `keep`. If there is none, drops the metrics of
+        the job and returns None. ConfigError as in `load`."""
         _, found = self._found(job, (job,), math.inf, None)
         return None if found is None else json.loads(found[0].tobytes())
 
     def once(self, job: str, make: Callable[[], Any]) -> Any:
-        """The result of a job, as JSON reads it back: from its checkpoint, or else made and kept.
-        ConfigError as in `load`."""
+        """The result of a job, as read back from JSON: from its checkpoint if there is one, else
+        computed by `make` and written. ConfigError as in `load`."""
         if self.kept(job) is None:
             self.keep(job, make())
         return self.kept(job)
@@ -168,8 +168,8 @@ class Run:
     def _found(
         self, job: str, logged: tuple[str, ...], most: float, forms: list | None
     ) -> tuple[int, list[np.ndarray] | None]:
-        """Step and arrays of the checked checkpoint of a job, (0, None) without one; drops metrics
-        beyond it. forms: shape and dtype of each array; None for any."""
+        """Step and arrays of the checkpoint of a job, after all checks; (0, None) if there is none.
+        Drops metrics beyond the checkpoint. forms: shape and dtype of each array; None for any."""
         path, step, leaves = self._path(job), 0, None
         if path.is_file():
             try:
@@ -199,9 +199,12 @@ class Run:
 
     def finish(self, results: dict[str, Any]) -> None:
         """Writes the results, arrays as results.npz, the rest as results.json, and sorts the
-        metrics. JSON has no NaN and no infinity: they become null. `not_finite` lists the names of
-        results of either file that are not finite, if any. `machines` are the records of `machine`
-        of all processes that worked on them, the last one first."""
+        metrics.
+
+        JSON has no NaN and no infinity: they become null. In results.json, `not_finite` lists the
+        names of the results in either file that are not finite, if there are any; `machines` has
+        the records of `machine` of all processes that worked on the run, the last one first.
+        """
         self._metrics.order()
         arrays: dict[str, Any] = {n: a for n, a in results.items() if isinstance(a, np.ndarray)}
         bad = [name for name, array in arrays.items() if not np.all(np.isfinite(array))]
@@ -217,7 +220,8 @@ class Run:
 
 
 def _finite(value: Any, name: str, bad: list[str]) -> Any:
-    """A value for JSON with None for numbers that are not finite; adds their names to `bad`."""
+    """A value for JSON: None replaces numbers that are not finite; their names are added to
+    `bad`."""
     if isinstance(value, dict):
         return {key: _finite(item, f"{name}.{key}", bad) for key, item in value.items()}
     if isinstance(value, list | tuple):

@@ -1,4 +1,4 @@
-"""Ctrl-C that waits until stopping is safe."""
+"""Ctrl-C is deferred until the run can stop safely."""
 
 import contextlib
 import signal
@@ -9,10 +9,11 @@ from typing import Any
 
 @contextlib.contextmanager
 def deferred_interrupt(notify: Callable[[], None] = lambda: None) -> Iterator[Callable[[], bool]]:
-    """Defers the first Ctrl-C (or SIGTERM): yields a function that returns True once one came. A
-    second one acts at once. An ignored signal, such as SIGINT under `nohup`, stays ignored.
+    """Defers the first Ctrl-C (or SIGTERM): yields a function that returns True after it was
+    received. A second one interrupts at once. An ignored signal, such as SIGINT under `nohup`, is
+    still ignored.
 
-    notify: called at the first one.
+    notify: called at the first signal.
     """
     asked = False
     # Only the main thread may handle signals; None: a handler from outside Python.

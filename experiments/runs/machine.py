@@ -1,4 +1,4 @@
-"""The machine of a run: what its times depend on."""
+"""A record of the machine of a run, on which its times depend."""
 
 import contextlib
 import os
@@ -16,9 +16,14 @@ _PEERS = "optiland", "batoid", "prysm", "rayoptics", "torch"
 
 
 def machine() -> dict[str, Any]:
-    """cpu: model. cores: number that this process may use. device: kind of JAX's devices, and
-    devices, their number. load: mean number of processes that ran in the minute before. python and
-    versions. commit: of the checkout, with + if a file differs from it; None outside of one."""
+    """The machine, versions and commit of this process.
+
+    cpu: model. cores: number of cores that this process may use.
+    device, devices: kind and number of JAX's devices.
+    load: mean number of running processes in the last minute.
+    python, versions: of Python, and of packages.
+    commit: of the checkout, with + if a file differs from it; None outside of a checkout.
+    """
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     versions = {}
     for name in (*_PACKAGES, *_PEERS):

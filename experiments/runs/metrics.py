@@ -13,7 +13,7 @@ from .disk import replace
 
 
 class Metrics:
-    """The file. It always has its header; rows are appended whole or not at all.
+    """The file metrics.csv. It always has a header; all rows of a call are appended or none.
 
     columns: columns between `job`, `step` and the last one, `check`.
     """
@@ -24,12 +24,12 @@ class Metrics:
         self._header = (",".join((*self.columns, "check")) + "\r\n").encode()
 
     def write(self, rows: list[list[str]]) -> None:
-        """Writes the file anew, with some rows."""
+        """Replaces the file by one with these rows."""
         replace(self.path, self._header + _text(rows))
 
     def mend(self) -> None:
-        """Repairs what a kill may leave: writes a missing or partial header, and drops a last line
-        without its end. ConfigError for other damage."""
+        """Repairs the file after the process was killed: writes a missing or partial header, and
+        drops an incomplete last line. ConfigError for other damage."""
         content = self.path.read_bytes() if self.path.exists() else b""
         if self._header.startswith(content):
             self.write([])
@@ -52,7 +52,7 @@ class Metrics:
         with open(self.path, "r+b", buffering=0) as file:
             end = file.seek(0, os.SEEK_END)
             try:
-                while content:  # more than once on a disk that fills
+                while content:  # a disk that is nearly full may accept only a part
                     content = content[file.write(content) :]
             except OSError:
                 file.truncate(end)
@@ -77,7 +77,7 @@ class Metrics:
             self.write(kept)
 
     def order(self) -> None:
-        """Sorts the rows by job and step, so that stops of the run do not change the file."""
+        """Sorts the rows by job and step, so that the file does not depend on interruptions."""
         rows = self._rows()
         place = {job: k for k, job in enumerate(dict.fromkeys(row[0] for row in rows))}
         self.write(sorted(rows, key=lambda row: (place[row[0]], int(row[1]))))

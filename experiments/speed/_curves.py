@@ -16,15 +16,16 @@ from . import _common, _peers, _work
 from ._reference import changed
 
 OURS, NODES = "drt_jax", "our nodes"
-# Errors in the table of `summary`.
+# Errors for which the table of `summary` has times.
 LEVELS = (1e-2, 1e-3, 1e-6)
 
 
 class Try(NamedTuple):
     """One sampling of one program.
 
-    size: number of rays a wavelength.
-    call: without arguments. error: of what it returns, relative.
+    size: number of rays per wavelength.
+    call: function without arguments that is timed.
+    error: relative error of its result.
     """
 
     program: str
@@ -35,8 +36,8 @@ class Try(NamedTuple):
 
 
 def aimed(lens: Lens, scene: Scene, order: int, values: Array) -> _peers.Rays:
-    """The nodes of our rule of an order for a field along y, as rays that we aimed, through the
-    lens with each row of values."""
+    """The nodes of our rule for a field along y, as rays that we aim through the lens with each row
+    of `values`. order: order of the rule."""
     points, weights = (np.asarray(a) for a in drt_jax.pupil.half_disc(order, order + 1))
     trace = jax.vmap(lambda v: drt_jax.trace_rays(changed(lens, v), scene, points))
     rays = jax.jit(trace)(values)
@@ -48,7 +49,7 @@ def samplings(
     lens: Lens, scene: Scene, sizes: Iterable[int], orders: Iterable[int], values: Array
 ) -> Iterator[tuple[str, Callable]]:
     """(name, rays) of all samplings: each pattern at the paraxial pupil and at the stop, and our
-    nodes, launched by us. values: of the variants of the lens."""
+    nodes, with launches that we compute. values: numbers of the variants of the lens."""
     for aim, where in (("paraxial", "paraxial pupil"), ("iterative", "aimed at the stop")):
         for kind, pattern in _peers.PATTERNS.items():
             for size in orders if kind == "Gaussian" else sizes:
@@ -60,8 +61,8 @@ def samplings(
 def of_spots(
     numbers: _peers.Lens, samplings: Iterable[tuple], what: Callable
 ) -> Iterator[tuple[str, str, Callable]]:
-    """The ways of all programs for `tried`. samplings: of `samplings`. what: call of a program's
-    `_peers.Spots`, a lens and rays."""
+    """The argument `ways` of `tried` for all programs. samplings: result of `samplings`. what:
+    function of a program's `_peers.Spots`, a lens and rays that returns the call."""
     for sampling, rays_of in samplings:
         for program, spots in _peers.SPOTS.items():
 
@@ -73,10 +74,10 @@ def of_spots(
 
 
 def tried(ways: Iterable[tuple], error: Callable) -> tuple[list[Try], dict[str, str]]:
-    """All tries of other programs, and why there are none, by program.
+    """All tries of other programs; and, by program, the reason why there are none.
 
     ways: program, sampling, and a function that returns the number of rays and the call.
-    error: of what a call returns.
+    error: function that returns the error of the result of a call.
     """
     found: list[Try] = []
     notes: dict[str, str] = {}
@@ -99,8 +100,8 @@ def tried(ways: Iterable[tuple], error: Callable) -> tuple[list[Try], dict[str, 
 def rows_of(
     task: str, ours: list[Try], ways: Iterable[tuple], error: Callable, repeats: int
 ) -> dict[str, Any]:
-    """Curves of a task for results.json, with `quartiles_s` of calls in turns; and why programs
-    have none. ways, error: see `tried`."""
+    """Curves of a task for results.json, with `quartiles_s` of alternating calls; and the reasons
+    why programs have none. ways, error: see `tried`."""
     others, notes = tried(ways, error)
     tries = [*ours, *others]
     seconds = _common.quartiles([one.call for one in tries], repeats)
@@ -113,7 +114,7 @@ def rows_of(
 
 
 def least(rows: list[dict[str, Any]], error: float) -> float:
-    """Least median seconds within an error; inf if no row is."""
+    """Smallest median time, s, of the rows within an error; inf if there are none."""
     known = (row["quartiles_s"][1] for row in rows if row["error"] <= error)
     return min(known, default=np.inf)
 
@@ -127,8 +128,8 @@ def faster(rows: list[dict[str, Any]], own: list[dict[str, Any]]) -> str:
 
 
 def summary(rows: list[dict[str, Any]]) -> str:
-    """Table of rows of `rows_of`: least error and times to some errors by task and program, and the
-    errors at which the program is faster than `drt_jax`."""
+    """Table of the rows of `rows_of`: smallest error, and times to reach some errors, by task and
+    program; and the errors at which the program is faster than `drt_jax`."""
     lines = []
     for (task,), some in _common.grouped(rows, "task").items():
         groups = _common.grouped(some, "program")

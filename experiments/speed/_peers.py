@@ -1,7 +1,7 @@
 """Other programs for the work of `benchmark`: an optional extra, each may be missing.
 
-A peer gets the lens as numbers, and samples the pupil in the ways that it offers, or with rays that
-we aimed. Differences in definition count as its error.
+A peer receives the numbers of the lens, and samples the pupil with its own samplings, or with rays
+that we aimed. Differences of definition count as its error.
 """
 
 import itertools
@@ -19,11 +19,11 @@ from drt_jax import pupil
 from ._common import rings
 from ._reference import changed, flatten
 
-# Steps of batoid's central differences, by curvatures (1/mm) and distances (mm): of those tried,
-# from 1e-7 down to 1e-12, the ones with the least error. One-sided differences are off by 2 % with
-# steps of 1e-7, and by 3e-4 with the best.
+# Steps of batoid's central differences, for curvatures (1/mm) and distances (mm): those with the
+# smallest error of the steps from 1e-7 to 1e-12. One-sided differences have an error of 2 % with
+# steps of 1e-7, and of 3e-4 with the best step.
 BENT, MOVED = 1e-8, 1e-6
-# Rays are launched so far in front of their first hits, mm.
+# Distance from the launch of rays to their first hits, mm.
 _BEFORE = 15.0
 
 
@@ -40,10 +40,10 @@ class Rays(NamedTuple):
     """Rays of one object point.
 
     points, weights: (Q, 2) on the unit disc, and (Q,).
-    aim: "paraxial" at the paraxial entrance pupil, or "iterative" at the stop, a mode of Optiland.
+    aim: "paraxial": at the paraxial entrance pupil; "iterative": at the stop, a mode of Optiland.
     launch: first hits and directions, (V, W, Q, 3) each, of rays that we aimed, for each variant of
-        a lens; None for none.
-    free: (2,), 0 where symmetry makes the mean of x or y 0, otherwise 1.
+        a lens; None for rays that are not launched by us.
+    free: (2,), 0 if the mean of x or of y is 0 by symmetry, otherwise 1.
     """
 
     points: np.ndarray
@@ -53,13 +53,13 @@ class Rays(NamedTuple):
     free: tuple[int, int] = (1, 1)
 
     def starts(self, k: int, wave: int) -> tuple[np.ndarray, np.ndarray]:
-        """Places in front of the lens and directions, (Q, 3), of `launch`."""
+        """Points in front of the lens and directions, (Q, 3) each, of the rays of `launch`."""
         hits, directions = (np.asarray(a[k, wave]) for a in self.launch or ())
         return hits - _BEFORE * directions, directions
 
 
 def _gaussian(size: int) -> tuple[np.ndarray, np.ndarray]:
-    """Optiland's GaussianQuadrature of so many rings."""
+    """Optiland's GaussianQuadrature with `size` rings."""
     from optiland import backend
     from optiland.distribution import GaussianQuadrature
 
@@ -69,7 +69,7 @@ def _gaussian(size: int) -> tuple[np.ndarray, np.ndarray]:
     return np.stack([own.x, own.y], axis=1), own.weights
 
 
-# (points, weights) of about as many rays, or, of "Gaussian", of so many rings.
+# (points, weights) of about the given number of rays; for "Gaussian", of the given number of rings.
 PATTERNS: dict[str, Callable[[int], tuple[np.ndarray, np.ndarray]]] = {
     "hexapolar": lambda size: pupil.hexapolar(rings(size)),
     "random": lambda size: pupil.random_disc(size, 0),
@@ -83,8 +83,8 @@ def rays_of(pattern: Callable, size: int, aim: str) -> Rays:
 
 
 def shifted(lens: drt_jax.Lens) -> Array:
-    """Numbers (4 S + 1, 2 S) in the order of `flatten`: as they are, each up and each down by its
-    step. A thickness does not move the sensor."""
+    """Numbers of the lens (4 S + 1, 2 S) in the order of `flatten`: unchanged, then each increased
+    and each decreased by its step. A thickness does not move the sensor."""
     steps = np.diag(np.repeat([BENT, MOVED], lens.count))
     return flatten(lens)[None] + np.concatenate([np.zeros((1, len(steps))), steps, -steps])
 
@@ -93,12 +93,14 @@ _first_order = jax.jit(drt_jax.first_order)
 
 
 class Lens:
-    """A centred lens of aspheres as NumPy arrays, and a scene: gaps (S,), the last to the sensor,
-    index (S + 1, W), field in radians, distance in mm. ValueError for other lenses.
+    """A centred lens of aspheres as NumPy arrays, and a scene. ValueError for other lenses.
+
+    It has gaps (S,), of which the last is that to the sensor, index (S + 1, W), field in radians,
+    distance in mm, and:
 
     clear: (S,), radius of each clear aperture, mm; inf at the stop, which rays fill.
-
-    variants: the lens with each row of `values`, (V, P); None: of `shifted`, the lens and 4 S more.
+    variants: the lens with each row of `values`, (V, P). None for the rows of `shifted`: the lens
+        and 4 S changed ones.
     """
 
     def __init__(
@@ -132,7 +134,7 @@ def _sigma(x: Any, y: Any, weights: Any, free: tuple[int, int]) -> Any:
 
 
 def _optiland_system(lens: Lens, index: np.ndarray, wavelength: float, k: int = 0):
-    """An Optiland lens, variant k, for one wavelength, um. index: (S + 1,)."""
+    """An Optiland lens for one wavelength, um. index: (S + 1,). k: index of the variant."""
     from optiland.materials import IdealMaterial
     from optiland.optic import Optic
 
@@ -150,7 +152,7 @@ def _optiland_system(lens: Lens, index: np.ndarray, wavelength: float, k: int = 
         optic.surfaces.add(index=i + 1, **kind, **shape)
     optic.surfaces.add(index=len(lens.gaps) + 1)
     optic.set_aperture("float_by_stop_size", 2 * lens.semi)
-    optic.surfaces[lens.stop + 1].semi_aperture = lens.semi  # what its search for rays needs
+    optic.surfaces[lens.stop + 1].semi_aperture = lens.semi  # needed by its ray aiming
     if np.isinf(lens.distance):
         optic.fields.set_type("angle")
         optic.fields.add(y=np.degrees(lens.field))
@@ -162,7 +164,7 @@ def _optiland_system(lens: Lens, index: np.ndarray, wavelength: float, k: int = 
 
 
 def _optiland_hits(optic: Any, lens: Lens, rays: Rays, wave: int, k: int = 0) -> Any:
-    """Traced rays of a wavelength, given by its number, of variant k."""
+    """Traced rays of variant k. wave: index of the wavelength."""
     from optiland import backend
     from optiland.rays import RealRays
 
@@ -179,7 +181,8 @@ def _optiland_hits(optic: Any, lens: Lens, rays: Rays, wave: int, k: int = 0) ->
 
 
 def optiland_spot(lens: Lens, rays: Rays, count: int = 1) -> Callable:
-    """value(k) -> RMS spot radii sigma (W,), mm, by NumPy, of the first `count` variants."""
+    """A function value(k) -> RMS spot radii sigma (W,), mm, with NumPy, for the first `count`
+    variants."""
     from optiland import backend
 
     backend.set_backend("numpy")
@@ -202,9 +205,9 @@ def optiland_spot(lens: Lens, rays: Rays, count: int = 1) -> Callable:
 
 
 def optiland_gradient(lens: Lens, rays: Rays) -> Callable:
-    """gradient() -> sigma (W,) and its derivatives (W, 2 S) by curvatures, thicknesses and the
-    sensor position, NaN where unknown, by PyTorch. Rays of `launch` stay where they were launched,
-    so their stop points move with the surfaces in front of the stop."""
+    """A function gradient() -> sigma (W,) and its derivatives (W, 2 S) by curvatures, thicknesses
+    and the sensor position, NaN where unknown, with PyTorch. The launch of rays of `launch` is
+    fixed, so that their stop points move with the surfaces in front of the stop."""
     import torch
     from optiland import backend
 
@@ -285,7 +288,7 @@ def _batoid_hits(optic, points, velocities):
 def _at_the_pupil(
     lens: Lens, variant: Variant, points: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Places in front of the lens and directions, (Q, 3), of rays through points (Q, 2) of the
+    """Points in front of the lens and directions, (Q, 3) each, of rays through points (Q, 2) of the
     paraxial entrance pupil."""
     place, radius = variant.pupil
     toward = np.array([0.0, np.tan(lens.field), 1.0])
@@ -298,7 +301,7 @@ def _at_the_pupil(
 
 
 def batoid_spot(lens: Lens, rays: Rays, count: int = 1) -> Callable:
-    """`optiland_spot` by batoid."""
+    """The same as `optiland_spot`, with batoid."""
     variants = lens.variants[:count]
     optics = [[_batoid_optic(lens, v, index) for index in lens.index.T] for v in variants]
     if rays.aim != "paraxial":
@@ -319,8 +322,8 @@ def batoid_spot(lens: Lens, rays: Rays, count: int = 1) -> Callable:
 
 
 def differences(value: Callable, count: int) -> Callable:
-    """gradient() of `optiland_gradient` by central differences. value: value(k) of variants of a
-    lens of `count` surfaces."""
+    """The function gradient() of `optiland_gradient`, by central differences. value: function
+    value(k) of the variants of a lens with `count` surfaces."""
     steps = np.repeat([BENT, MOVED], count)
 
     def gradient() -> tuple[np.ndarray, np.ndarray]:
@@ -332,13 +335,13 @@ def differences(value: Callable, count: int) -> Callable:
 
 
 def batoid_gradient(lens: Lens, rays: Rays) -> Callable:
-    """`optiland_gradient` by central differences of batoid. Each variant has its own paraxial
-    pupil, or rays that were aimed for it."""
+    """The same as `optiland_gradient`, by central differences with batoid. Each variant has its own
+    paraxial pupil, or rays that were aimed for it."""
     return differences(batoid_spot(lens, rays, len(lens.variants)), len(lens.gaps))
 
 
 class Spots(NamedTuple):
-    """What a program makes of a `Lens` and `Rays`."""
+    """Functions of one program that take a `Lens` and `Rays`."""
 
     sigma: Callable
     gradient: Callable
@@ -351,15 +354,17 @@ SPOTS = {
 
 
 def of_all(program: Spots, lens: Lens, rays: Rays) -> Callable:
-    """values() -> sigma of all variants, (V, W)."""
+    """A function values() -> sigma of all variants, (V, W)."""
     count = len(lens.variants)
     value = program.sigma(lens, rays, count)
     return lambda: np.array([value(k) for k in range(count)])
 
 
 def batoid_rays(lens: Lens, points: np.ndarray, directions: np.ndarray) -> Callable:
-    """trace() -> hits (Q, 2) on the sensor at the first wavelength, mm. points: (Q, 3), in front of
-    the lens, mm. directions: (Q, 3), unit vectors."""
+    """A function trace() -> hits (Q, 2) on the sensor at the first wavelength, mm, with batoid.
+
+    points: (Q, 3), in front of the lens, mm. directions: (Q, 3), unit vectors.
+    """
     optic = _batoid_optic(lens, lens.variants[0], lens.index[:, 0])
 
     def trace() -> np.ndarray:
@@ -370,8 +375,8 @@ def batoid_rays(lens: Lens, points: np.ndarray, directions: np.ndarray) -> Calla
 
 
 def network_step(batch: int, patch: int, rate: float) -> Callable:
-    """step(): one Adam step of the same RED-Net in PyTorch, channels last, on the mean absolute
-    error of random images, on a GPU where JAX uses one."""
+    """A function step(): one Adam step of the same RED-Net in PyTorch, channels last, for the mean
+    absolute error of random images; on a GPU if JAX uses one."""
     import torch
     from torch import nn
 

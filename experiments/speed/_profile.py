@@ -1,10 +1,10 @@
-"""A performance profile (Dolan and More, Math. Program. 91, 2002): which share of many scenes each
-program solves within how many times the time of the fastest.
+"""A performance profile (Dolan and More, Math. Program. 91, 2002): the share of many scenes that
+each program solves, over the ratio of its time to that of the fastest program.
 
-A scene is a lens with its clear apertures and an object point in one wavelength; it is solved to a
-tolerance if the error of the RMS spot radius sigma is within it. Each program is swept over its own
-samplings, from few rays to many, until an error is below `_ENOUGH`, a call takes more than
-`_LONGEST`, or more rays do not help.
+A scene is a lens with its clear apertures and an object point in one wavelength. It is solved to a
+tolerance if the error of the RMS spot radius sigma is within the tolerance. Each program is swept
+over its own samplings, from few rays to many, until an error is below `_ENOUGH`, a call takes more
+than `_LONGEST`, or more rays do not help.
 """
 
 import dataclasses
@@ -32,11 +32,13 @@ from ._common import Numbers, not_empty, within
 from ._reference import reference, relative_error, sigmas
 
 TOLERANCES = (1e-3, 1e-6, 1e-9)
-# Of a sweep: an error, and seconds of a call. More rays help if they divide the error by _HELP.
+# Ends of a sweep: an error, and seconds of a call. More rays help if they divide the error by
+# _HELP.
 _ENOUGH, _LONGEST, _HELP = 1e-9, 1.0, 1.5
-# Orders and sizes of our rule for a clipped pupil; orders of a size share a program and its time.
+# Orders and sizes of our rule for a clipped pupil; orders of one size share a compiled program and
+# have the same time.
 _CLIPPED = (6, 14), (10, 14), (14, 14), (28, 28)
-# Other patterns are left out: random points would need a million rays for 1e-3.
+# Other patterns are left out: random points need a million rays for 1e-3.
 _PATTERNS = ("hexapolar", "Gaussian")
 _GREEN = 0.5875618  # um
 Made = Iterator[tuple[Callable, float]]
@@ -62,9 +64,10 @@ class Profile:
     lenses: bundled lenses, for an object at infinity in green light.
     files: folder of `.zmx` files, at their primary wavelength; "" for none.
     parts: fields relative to the widest.
-    rays, orders, own_orders: samplings to try, each from few to many: rays of patterns, orders of
-        the quadratures of other programs, and of ours, each of which is compiled.
-    repeats: timed turns.
+    rays, orders, own_orders: samplings to try, each from few rays to many: numbers of rays of
+        patterns, orders of the quadratures of other programs, and orders of ours, each of which is
+        compiled.
+    repeats: number of timed turns.
     """
 
     lenses: tuple[LensFields, ...] = ()
@@ -117,8 +120,9 @@ def sweep(made: Made) -> Made:
 
 
 def attempt(sweeps: Sequence[Made]) -> tuple[list[list[Callable]], Row]:
-    """By tolerance, the first call of each sweep that meets it; and a row of results: `error`, the
-    least error, `first_s`, and `why` no call meets the first tolerance."""
+    """For each tolerance, the first call of each sweep that reaches it; and a row of results:
+    `error`, the smallest error; `first_s`; and `why`, the reason if no call reaches the first
+    tolerance."""
     calls: list[list[Callable]] = [[] for _ in TOLERANCES]
     start, least, why = time.perf_counter(), np.inf, ""
     for made in sweeps:
@@ -140,7 +144,7 @@ def attempt(sweeps: Sequence[Made]) -> tuple[list[list[Callable]], Row]:
 
 
 def rows_at(at: At, sizes: Profile) -> list[Row]:
-    """A row of each program; ValueError if the reference knows no spot there."""
+    """A row for each program. ValueError if the reference has no spot there."""
     if at.lens.elements or at.lens.apertures or at.lens.phase or at.lens.tilt is not None:
         raise ValueError("the reference knows centred lenses with round apertures alone")
     truth = reference(*at, slopes=False)
@@ -169,8 +173,8 @@ def rows_at(at: At, sizes: Profile) -> list[Row]:
 
 
 def of_lens(name: str, make: Callable, sizes: Profile) -> dict[str, list[Row]]:
-    """Rows of the scenes of a lens, which share compiled programs, and why there are none. make:
-    scenes."""
+    """Rows of the scenes of a lens, which share compiled programs; and the reasons for scenes
+    without rows. make: function that returns the scenes."""
     jax.clear_caches()
     found: dict[str, list[Row]] = {"profile": [], "left_out": []}
     field = None
@@ -178,7 +182,7 @@ def of_lens(name: str, make: Callable, sizes: Profile) -> dict[str, list[Row]]:
         for at in make():
             field = math.degrees(at.field)
             found["profile"] += [{"lens": name} | row for row in rows_at(at, sizes)]
-    except ValueError as why:  # wider fields have none either
+    except ValueError as why:  # wider fields have no reference either
         found["left_out"] += [{"lens": name, "field_deg": field, "why": str(why)[:120]}]
     return found
 
@@ -201,7 +205,7 @@ def from_file(path: pathlib.Path, parts: Sequence[float]) -> list[At]:
 
 
 def jobs(sizes: Profile) -> dict[str, Callable]:
-    """What measures each lens, by name."""
+    """Functions that measure each lens, by name."""
     makers = {of.lens: partial(bundled, of, sizes.parts) for of in sizes.lenses}
     folder = sizes.files and pathlib.Path(sizes.files)
     for path in sorted(folder.glob("*.zmx")) if folder and folder.is_dir() else ():
@@ -210,8 +214,8 @@ def jobs(sizes: Profile) -> dict[str, Callable]:
 
 
 def ratios(rows: Sequence[Row], k: int) -> dict[str, np.ndarray]:
-    """By program, its time over that of the fastest in each scene whose reference is known well
-    enough for TOLERANCES[k]; inf where it is not solved."""
+    """By program, its time divided by that of the fastest program, for each scene whose reference
+    is accurate enough for TOLERANCES[k]; inf if the program does not solve the scene."""
     errors = ((row, row["reference_error"]) for row in rows)
     known = [row for row, error in errors if error is not None and 3 * error < TOLERANCES[k]]
     seconds: dict[str, list[float]] = {}
@@ -226,8 +230,8 @@ def ratios(rows: Sequence[Row], k: int) -> dict[str, np.ndarray]:
 
 
 def summary(rows: Sequence[Row]) -> str:
-    """Table of the shares that each program solves, its median ratio to the fastest there, and the
-    median seconds of first calls."""
+    """Table of the share of scenes that each program solves, the median ratio of its time to that
+    of the fastest program, and the median time of first calls."""
     lines = []
     for (program,), own in _common.grouped(rows, "program").items():
         cells = []
@@ -243,14 +247,14 @@ def summary(rows: Sequence[Row]) -> str:
 
 
 def reasons(rows: Sequence[Row]) -> str:
-    """Table of why scenes are not solved to the first tolerance, with counts."""
+    """Table of the reasons why scenes are not solved to the first tolerance, with counts."""
     counts = Counter((row["program"], row["why"]) for row in rows if row["why"])
     lines = [(*key, count) for key, count in counts.items()]
     return _common.table(("program", f"not to {TOLERANCES[0]:.0e} because", "scenes"), lines)
 
 
 def not_compared(rows: Sequence[Row]) -> str:
-    """Table of why scenes are left out, with the lenses."""
+    """Table of the reasons why scenes are left out, with the lenses."""
     lines = [
         (re.sub(r"\S*/", "", why), ", ".join(dict.fromkeys(row["lens"] for row in own)))
         for (why,), own in _common.grouped(rows, "why").items()

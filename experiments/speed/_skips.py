@@ -1,6 +1,6 @@
-"""The pairs of calls of `skips`: the same answer with a skip and without it, and the error of each.
+"""The pairs of calls of `skips`: the same result with a skip and without it, and the error of each.
 
-Truth is a trace by Snell's law (`_reference`), exact sums or, for kernels, very many rays.
+The reference is a trace by Snell's law (`_reference`), exact sums or, for kernels, very many rays.
 """
 
 import dataclasses
@@ -26,20 +26,20 @@ from drt_jax.rays.solve import solve, solve_aimed
 from . import _reference, _work
 from ._reference import relative_error, sigmas
 
-_SEEDS = 8  # of random rays, whose error is the root mean square
-_POSITIONS = 21  # of the sensor, and of the object
+_SEEDS = 8  # seeds of random rays; their error is the root mean square over these
+_POSITIONS = 21  # number of positions of the sensor, and of the object
 
 
 class Way(NamedTuple):
-    """One of two ways to an answer.
+    """One of two ways to compute a result.
 
-    words: what is called.
-    call: without arguments, or None if its `seconds` are known.
-    error: of the answer.
-    rays: that a call traces, or None where the number says nothing.
+    words: description of the call.
+    call: function without arguments, or None if its `seconds` are known.
+    error: error of the result.
+    rays: number of rays that a call traces, or None if the number is not meaningful.
     compile_s: seconds of compilation, or None.
-    once_s: seconds before the first call, with programs that are compiled, or None for none.
-    seconds: of a call.
+    once_s: seconds of the preparation before the first call, with compiled programs; None for none.
+    seconds: seconds of a call.
     """
 
     words: str
@@ -57,7 +57,7 @@ class View(NamedTuple):
     lens, scene: the lens and the point.
     rule: pupil rule converged to the tolerance of the run.
     once_s: seconds to find the rule.
-    truth: moments of an independent trace.
+    truth: reference, moments of an independent trace.
     """
 
     lens: Lens
@@ -76,7 +76,7 @@ class View(NamedTuple):
 
 
 def once(make: Callable, *given: Any) -> tuple[Any, float]:
-    """What is made before the calls, and the seconds for it when its programs are compiled."""
+    """The result of a preparation, and its time, s, with compiled programs."""
     make(*given)
     began = time.perf_counter()
     return jax.block_until_ready(make(*given)), time.perf_counter() - began
@@ -85,12 +85,13 @@ def once(make: Callable, *given: Any) -> tuple[Any, float]:
 def program(
     words: str, error: Callable[[Any], float], function: Callable, *given: Any, **known: Any
 ) -> Way:
-    """A way that is one compiled program.
+    """A way that consists of one compiled program.
 
-    error: function of what the call returns. given: arguments of the function.
+    words: description. error: function of the result. function, given: what is compiled, and its
+    arguments. known: further fields of `Way`.
     """
-    jax.clear_caches()  # neither way uses a trace that the other has cached
-    options = known_options(LARGE)  # as the package has itself
+    jax.clear_caches()  # no way shall use a trace that another has cached
+    options = known_options(LARGE)  # the options that the package uses
     call, measured = _work.compiled(jax.jit(function, compiler_options=options), *given)
     return Way(words, call, error(call()), compile_s=measured["compile_s"], **known)
 
@@ -123,13 +124,13 @@ def spot(at: View, words: str, rule: PupilRule, **known: Any) -> Way:
 
 @cache
 def converged(config: Any, on_axis: bool) -> Way:
-    """Moments of the spot by the rule of the tolerance, as several rows have them."""
+    """Moments of the spot by the rule converged to the tolerance, which several rows use."""
     at = view(config, on_axis)
     return spot(at, f"{_kind(at.rule)} of converge", at.rule, once_s=at.once_s)
 
 
 def symmetry(config: Any, on_axis: bool) -> list[Way]:
-    """The spot of a part of the pupil, and of the whole."""
+    """The spot from a part of the pupil, by symmetry, and from the whole pupil."""
     at = view(config, on_axis)
     whole = dataclasses.replace(at.rule, symmetry="none")
     words = f"{_kind(at.rule)}, {at.rule.symmetry}"
@@ -138,12 +139,12 @@ def symmetry(config: Any, on_axis: bool) -> list[Way]:
 
 
 def _kind(rule: PupilRule) -> str:
-    """The rule in words."""
+    """The name of a rule."""
     return f"{type(rule).__name__}({int(rule.order)})"
 
 
 def order(config: Any) -> list[Way]:
-    """The order that a tolerance needs, found before, and one that suffices for many lenses."""
+    """The order for a tolerance, found before, and an order that suffices for many lenses."""
     at = view(config, False)
     generous = ordered(at.rule, config.generous)
     return [converged(config, False), spot(at, f"{_kind(generous)}, to be safe", generous)]
@@ -175,7 +176,7 @@ def quadrature(config: Any) -> list[Way]:
 
 
 def with_planes(lens: Lens, count: int) -> Lens:
-    """The lens with planes in front of the sensor, between which nothing changes."""
+    """The lens with `count` dummy planes in front of the sensor, which change no ray."""
     step = (lens.sensor - lens.vertices[lens.count - 1]) / (count + 1)
     for _ in range(count):
         lens = design.with_dummy(lens, lens.count - 1, step)
@@ -183,8 +184,8 @@ def with_planes(lens: Lens, count: int) -> Lens:
 
 
 def all_traced(lens: Lens) -> Lens:
-    """The lens whose dead surfaces are traced, because the medium behind each surface has a name of
-    its own. Its index stays as it is."""
+    """The lens with all surfaces traced, because the medium behind each surface has another name.
+    The indices do not change."""
     names = (f"{name} {k}" if k else name for k, name in enumerate(lens.glasses))
     return dataclasses.replace(lens, labels=Labels(lens.name, tuple(names)))
 
@@ -199,7 +200,7 @@ def dead(config: Any) -> list[Way]:
 
 
 def aimed(config: Any) -> list[Way]:
-    """Rays by aiming alone, or with the search for those that are missing."""
+    """Rays by aiming alone, or with the search for missing rays."""
     at = view(config, False)
 
     def by(solver: Callable) -> Way:
@@ -212,7 +213,7 @@ def aimed(config: Any) -> list[Way]:
 
 
 def derivatives(config: Any, forward: bool) -> list[Way]:
-    """The derivative of a spot radius by one thickness, alone or among those of the whole lens."""
+    """The derivative of a spot radius by one thickness alone, or by all numbers of the lens."""
     at = view(config, False)
     k = min(at.lens.stop, at.lens.count - 2)
     exact = at.truth.gradient[0, 0, at.lens.count + k]
@@ -247,7 +248,7 @@ reverse, forward = (partial(derivatives, forward=way) for way in (False, True))
 
 
 def sensors(config: Any) -> list[Way]:
-    """The spot at many places of the sensor: polynomials of one trace, or a trace for each."""
+    """The spot at many sensor positions: polynomials from one trace, or a trace for each."""
     at = view(config, False)
     reach = 20 * float(at.truth.sigma[0])
     places = at.lens.sensor + jnp.linspace(-reach, reach, _POSITIONS)

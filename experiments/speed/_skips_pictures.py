@@ -21,15 +21,15 @@ from . import _work
 from ._reference import reference, relative_error
 from ._skips import View, Way, once, program, view
 
-# Side of kernels, pixels; standard deviations of a spot across one.
+# Side of kernels, pixels; number of standard deviations of a spot across a kernel.
 _SIZE, _WIDE = 21, 6.0
-# Rays of the truth of kernels, by parts.
+# Number of rays of the reference of kernels, which are traced in parts.
 _ROUNDS, _ROUND = 4, 2**16
-_IMAGES, _PATCH = 16, 64  # of a batch, and pixels along the side of each
+_IMAGES, _PATCH = 16, 64  # images of a batch, and pixels along the side of each
 
 
 def _pixel(at: View) -> float:
-    """Side of a pixel, mm, for which a kernel holds the spot."""
+    """Side of a pixel, mm, for which the kernel contains the spot."""
     return _WIDE * float(np.max(at.truth.sigma)) / _SIZE
 
 
@@ -54,7 +54,7 @@ _compiled_trace = jax.jit(_traced)
 
 
 def _kernel(lens: Lens, scene: Scene, pixel: float) -> np.ndarray:
-    """The kernel of the first wavelength by very many rays: the truth."""
+    """The kernel of the first wavelength by very many rays: the reference."""
     points = jnp.asarray(pupil.sobol_disc(_ROUNDS * _ROUND)[0]).reshape(_ROUNDS, _ROUND, 2)
     found = [_compiled_trace(lens, scene, some) for some in points]
     hits, arrives = (jnp.concatenate(part) for part in zip(*found))
@@ -62,7 +62,8 @@ def _kernel(lens: Lens, scene: Scene, pixel: float) -> np.ndarray:
 
 
 def separable(config: Any) -> list[Way]:
-    """A batch of images blurred by a row and a column, or by all pixels of the kernel."""
+    """A batch of images, convolved with the row and the column of separable kernels, or with whole
+    kernels."""
     at = view(config, True)
     found = drt_jax.psf_moments(at.lens, at.scene, at.rule)
     pixel, rng = _pixel(at), np.random.default_rng(0)
@@ -92,7 +93,7 @@ def separable(config: Any) -> list[Way]:
 
 
 def polynomials(config: Any) -> list[Way]:
-    """A kernel by polynomials of the beam, or by a histogram of traced rays."""
+    """A kernel from polynomials of the beam, or from a histogram of traced rays."""
     at = view(config, False)
     scene, pixel = dataclasses.replace(at.scene, wavelengths=at.scene.wavelengths[:1]), _pixel(at)
     truth = _kernel(at.lens, scene, pixel)
@@ -148,7 +149,8 @@ def few_kernels(config: Any) -> list[Way]:
 
 
 def kept(config: Any) -> list[Way]:
-    """The first gradient of a new process, with programs that another one kept, or without."""
+    """The first gradient in a new process, with compiled programs of an earlier process, or
+    without."""
     file, distance = pathlib.Path(config.lens), 1e3 * config.distance_m
     lens = str(file.resolve()) if file.is_file() else config.lens
     truth = reference(drt_jax.load_lens(lens), 0.0, distance, [0.53])

@@ -1,9 +1,10 @@
 """Run time against error of kernels and transfer functions by waves, of several programs.
 
-One object point at infinity in one colour, with the sensor at the paraxial focus. Errors are
-against `_wave_reference`, for light that fills the stop or the beam in front of the lens evenly,
-whichever a program is closer to: of a kernel, the sum of absolute differences of its pixels; of
-contrast, the largest difference, tangential or sagittal.
+The scene is one object point at infinity in one wavelength, with the sensor at the paraxial focus.
+The reference is `_wave_reference`, for light that fills evenly the stop, or the beam in front of
+the lens; each program is compared with the one to which it is closer. The error of a kernel is the
+sum of absolute differences of its pixels; that of contrast the largest difference, tangential or
+sagittal.
 """
 
 import dataclasses
@@ -21,17 +22,17 @@ from . import _common, _curves, _psf_peers, _wave_reference, _work
 from ._common import Numbers, not_empty, odd, within
 from ._psf_peers import Shot
 
-_NODES = 6  # of Gauss along a side of a pixel
+_NODES = 6  # Gauss nodes along the side of a pixel
 
 
 @dataclasses.dataclass(frozen=True)
 class Waves:
     """Settings of kernels and transfer functions.
 
-    cells: of our grids, along a side.
-    samples: rays along a side of the pupils of other programs.
-    pixel_um, size: of the kernel.
-    frequencies: cycles/mm, of the contrast.
+    cells: numbers of cells along a side of our grids.
+    samples: numbers of rays along a side of the pupils of other programs.
+    pixel_um, size: side of a pixel, um, and side of the kernel, pixels.
+    frequencies: frequencies of the contrast, cycles/mm.
     """
 
     cells: Annotated[tuple[int, ...], not_empty, within(8, 1024)] = (32, 48, 64, 96, 128, 192)
@@ -42,7 +43,7 @@ class Waves:
 
 
 def focused(lens: Lens, field: float, wavelength: float, sizes: Waves) -> Shot:
-    """The kernel of a lens that is refocused to infinity."""
+    """The shot of a lens that is refocused for an object at infinity."""
     waves = np.array([wavelength])
     first = drt_jax.first_order(lens, math.inf, waves)
     lens = dataclasses.replace(lens, sensor=first.image_distance[0])
@@ -53,10 +54,12 @@ def _curves_of(
     at: Shot, sizes: Waves, task: str, ours: Callable, makers: dict[str, tuple[str, Callable]],
     error: Callable, repeats: int,
 ) -> dict[str, Any]:  # fmt: skip
-    """Curves of a task, and of programs without one, why.
+    """Curves of a task; and the reasons for programs that have none.
 
-    ours: function of the lens and a sampling. makers: by sampling, its program, and call of rays
-        along a side. error: of what a call returns.
+    ours: function of the lens and a sampling.
+    makers: by sampling, the program and a function of the number of rays along a side that returns
+        the call.
+    error: function that returns the error of the result of a call.
     """
     tries, rule = [], at.model("waves", 1e-3).rule
     for cells in sizes.cells:
@@ -89,7 +92,7 @@ def kernels(at: Shot, sizes: Waves, repeats: int) -> dict[str, Any]:
         psf = _psf_peers.batoid(at, samples)
         return lambda: _psf_peers.collected(*psf(), pixel, size)
 
-    def prysm(samples: int) -> Callable:  # it traces nothing: the pupil is ours
+    def prysm(samples: int) -> Callable:  # prysm does not trace: it gets our pupil function
         rule = at.model("waves", 1e-3).rule
         return _psf_peers.prysm(at, *_psf_peers.pupil(at, rule, samples, chief)[:2])
 

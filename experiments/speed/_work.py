@@ -1,4 +1,4 @@
-"""Tools of `benchmark`: compiled programs, rows, other processes, growing scenes."""
+"""Tools of `benchmark`: compiled programs, rows, other processes, scenes of growing size."""
 
 import os
 import re
@@ -56,9 +56,12 @@ def hits(lens: Lens, field: Any, distance: Any, waves: Array, points: Array) -> 
 
 
 def compiled(function: Callable, *arguments: Any) -> tuple[Callable, dict[str, float]]:
-    """Compiles a function, jitted or not, for its arguments. Returns a call without arguments and
-    what is MEASURED: seconds of compilation with tracing, MiB of memory, and number of kernels
-    (those in a loop once). Donated arguments are copied for each call."""
+    """Compiles a function, jitted or not, for its arguments.
+
+    Returns a call without arguments, and the numbers of MEASURED: seconds of compilation with
+    tracing, MiB of memory, and number of kernels (a kernel in a loop counts once). Donated
+    arguments are copied for each call.
+    """
     function = function if hasattr(function, "lower") else jax.jit(function)
     start = time.perf_counter()
     lowered = function.lower(*arguments)
@@ -78,7 +81,7 @@ def compiled(function: Callable, *arguments: Any) -> tuple[Callable, dict[str, f
 
 
 def peer(name: str, make: Callable[[], tuple], how: str = "") -> dict[str, tuple | str]:
-    """(call, error) of a peer by name and version; or why there is none, by name."""
+    """(call, error) by name and version of a peer; or the reason why there is none, by its name."""
     try:
         return {f"{name} {version(name)}{how}": make()}
     except ImportError as missing:
@@ -96,7 +99,7 @@ def row(task: str, seconds: float, **known: Any) -> Row:
 def rows_of(
     task: str, ours: tuple, error: float | None, peers: dict[str, tuple | str], repeats: int
 ) -> list[Row]:
-    """Rows of one task. ours: from `compiled`. error: our error. peers: from `peer`."""
+    """Rows of one task. ours: result of `compiled`. error: our error. peers: results of `peer`."""
     call, measured = ours
     ready = {name: peer for name, peer in peers.items() if not isinstance(peer, str)}
     seconds, *theirs = _common.medians([call, *(other for other, _ in ready.values())], repeats)
@@ -112,8 +115,8 @@ def rows_of(
 
 
 def in_a_new_process(code: str, environment: dict[str, str]) -> list[float]:
-    """The numbers that Python code prints in its last line, run without a compilation cache unless
-    `environment` sets one."""
+    """Runs Python code in a new process, without a compilation cache unless `environment` sets one.
+    Returns the numbers in its last line of output."""
     clean = {k: v for k, v in os.environ.items() if k != "JAX_COMPILATION_CACHE_DIR"}
     options = {"env": clean | environment, "cwd": _common.ROOT}
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, **options)
@@ -122,8 +125,8 @@ def in_a_new_process(code: str, environment: dict[str, str]) -> list[float]:
 
 
 def first_gradients(lens: str, field: float, distance: float) -> np.ndarray:
-    """The height of a spot (RMS in y, mm) that a new process finds with its gradient, and the
-    seconds from its start; without and with saved programs, (2, 2)."""
+    """Results of a new process that computes a spot with its gradient: RMS height of the spot in y,
+    mm, and seconds since its start; without and with saved programs, (2, 2)."""
     code = _FIRST.format(lens=lens, field=field, distance=distance)
     with tempfile.TemporaryDirectory() as folder:
         cache = {"JAX_COMPILATION_CACHE_DIR": folder}
@@ -144,8 +147,8 @@ def bundle_seconds(config: Any) -> float:
 
 
 def counts(lens: Lens, distance: float, wavelengths: tuple[float, ...]) -> dict[str, int]:
-    """Number of solves for rays in a training step, by what it trains: occurrences of `attach`
-    (`rays.solve`) in the jaxpr of the step."""
+    """Number of solves for rays in a training step, by the trained numbers. It is the number of
+    occurrences of `attach` (`rays.solve`) in the jaxpr of the step."""
     near, far = distance / 2, distance
     cases = {
         "sensor trained, one depth": (("sensor",), (far, far)),
@@ -176,8 +179,8 @@ def _plates(count: int) -> Lens:
 
 
 def growth(lens: Lens, field: float, distance: float, repeats: int) -> dict[str, list]:
-    """Times of a trace over three decades of rays, surfaces and wavelengths: lists of (number,
-    seconds)."""
+    """Times of a trace for numbers of rays, surfaces and wavelengths over three decades: lists of
+    (number, seconds)."""
 
     def seconds(lens, rays, waves, angle=field):
         points = jnp.asarray(pupil.random_disc(rays, 0)[0])

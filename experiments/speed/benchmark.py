@@ -1,20 +1,27 @@
 """Run time of this and other programs for the same work in the same run.
 
 Calls alternate, and their medians are compared. Spots are curves: each program is swept over its
-own samplings, also with our nodes. Errors are relative: of the RMS spot radius sigma, or the worse
-of sigma and its derivatives by curvatures and thicknesses at fixed stop points, against an integral
-over a sequential trace by Snell's law. Optiland's derivatives keep the launch of our rays fixed,
-and rays through the paraxial pupil differ from rays through the stop. Such derivatives are correct,
-but of other quantities, and differ by 0.2 and 3 %. Peers are an extra, `pip install -e '.[peers]'`;
-the row of a missing one
-says so. Writes results.json: `curves` hold `task`, `program`, `sampling`, `size` (rays a
-wavelength), `error`, `quartiles_s`, `repeats`; `missing`, why a program has none; `rows` hold
-`task`, `ours_s`, `peer`, `peer_s`, `ratio` (theirs / ours), `ours_error`, `peer_error`,
-`compile_s`, `peak_mb` and `kernels` (ours); `profile` hold `lens`, `field_deg`, `reference_error`,
-`program`, `error` (the least), `first_s` (making and first calls of all samplings), `quartiles_s`
-to each tolerance and `why` there is none; `left_out`, lenses without a reference; `counts`, the
-solves for rays of a training step; `work`, run time over numbers of rays, surfaces and wavelengths;
-`machines`, where it ran. Draws run time against error, the profile, and the growth.
+own samplings, and also gets our nodes. Errors are relative, of the RMS spot radius sigma, or the
+larger of those of sigma and of its derivatives by curvatures and thicknesses at fixed stop points.
+The reference is an integral over a sequential trace by Snell's law. Optiland's derivatives keep the
+launch of our rays fixed, and rays through the paraxial pupil differ from rays through the stop.
+These derivatives are correct, but of other quantities; they differ by 0.2 and 3 %. Other programs
+are an extra, `pip install -e '.[peers]'`; the row of a missing one names it.
+
+Writes results.json:
+
+- `curves`: `task`, `program`, `sampling`, `size` (rays per wavelength), `error`, `quartiles_s`,
+  `repeats`; `missing`: the reasons why programs have no curve;
+- `rows`: `task`, `ours_s`, `peer`, `peer_s`, `ratio` (theirs / ours), `ours_error`, `peer_error`,
+  `compile_s`, `peak_mb` and `kernels` (ours);
+- `profile`: `lens`, `field_deg`, `reference_error`, `program`, `error` (the smallest), `first_s`
+  (preparation and first calls of all samplings), `quartiles_s` for each tolerance, and `why` there
+  is none; `left_out`: lenses without a reference;
+- `counts`: solves for rays in a training step;
+- `work`: run time over numbers of rays, surfaces and wavelengths;
+- `machines`: the machines on which it ran.
+
+Draws run time over error, the profile, and the growth of run time.
 """
 
 import dataclasses
@@ -56,11 +63,11 @@ from .snell import trace_snell
 class Config:
     """Settings of the experiment; see configs/benchmark.yaml.
 
-    repeats: timed turns of each program (fewer for long ones).
-    rays: rays of the patterns of other programs.
-    orders: orders of quadratures, ours and of other programs.
-    bundle: rays of the task of many rays.
-    batch, patch: patches of the network's step, and their side, pixels.
+    repeats: number of timed turns of each program (fewer for long ones).
+    rays: numbers of rays of the patterns of other programs.
+    orders: orders of quadratures, ours and those of other programs.
+    bundle: number of rays of the task with many rays.
+    batch, patch: number of patches in a step of the network, and their side, pixels.
     disturbed: number of disturbed lenses.
     tasks: names of the tasks to run; empty for all.
     growth: True to measure how run time grows with the scene.
@@ -114,12 +121,12 @@ def swept(
     config: Config, task: str, lens: Lens, variants: Array, ours: Callable, theirs: Callable,
     error: Callable,
 ) -> dict[str, Any]:  # fmt: skip
-    """Curves of sigma at the first wavelength, and why programs have none.
+    """Curves of sigma at the first wavelength, and the reasons why programs have none.
 
     variants: (V, P), numbers of the lens for other programs, see `_peers.Lens`.
-    ours: compiled call for a function from numbers (P,) to sigma.
-    theirs: call of another program, see `_curves.of_spots`.
-    error: of what a call returns.
+    ours: function that compiles a call from a function of numbers (P,) that returns sigma.
+    theirs: function that makes the call of another program, see `_curves.of_spots`.
+    error: function that returns the error of the result of a call.
     """
     _, field, distance = config.scene
     waves, tries = config.wavelengths_um[:1], []
@@ -164,8 +171,8 @@ def spot_curves(config: Config, gradient: bool) -> dict[str, Any]:
 
 
 def disturbed_curves(config: Config) -> dict[str, Any]:
-    """Curves of sigma of many disturbed lenses, (V, 1). Curvatures are off by 0.1 % and distances
-    by 0.02 mm, one standard deviation. The lenses of other programs are made before the time is
+    """Curves of sigma of many disturbed lenses, (V, 1). The standard deviations are 0.1 % for
+    curvatures and 0.02 mm for distances. The lenses of other programs are made before the time is
     measured."""
     lens, *given = config.scene
     values = flatten(lens)
@@ -194,7 +201,12 @@ def waves_curves(config: Config, of: Callable) -> dict[str, Any]:
 
 
 def bundle_task(config: Config) -> list[Row]:
-    """Skew rays through random points of the stop, one wavelength, to the sensor."""
+    """Skew rays through random points of the stop, one wavelength, to the sensor.
+
+    The error is the largest difference from a sequential trace of the first 1000 rays. batoid
+    traces the same rays from a plane in front of their first hits. Further rows are for several CPU
+    devices, for float32, and for the gradient.
+    """
     lens, field, distance = config.scene
     waves = jnp.asarray(config.wavelengths_um[:1])
     trace, points = config.bundle_trace
@@ -247,8 +259,8 @@ def bundle_task(config: Config) -> list[Row]:
 
 
 def network_task(config: Config) -> list[Row]:
-    """One Adam step of optics and network; of the network alone; and optics and sensor layer alone,
-    forwards and back."""
+    """One Adam step of optics and network; one of the network alone; and the forward and backward
+    pass of optics and sensor layer alone."""
     rng = np.random.default_rng(config.seed)
     lens, _, distance = config.scene
     init, apply = network.red_net()
@@ -297,7 +309,8 @@ def network_task(config: Config) -> list[Row]:
 
 
 def first_task(config: Config) -> list[Row]:
-    """A new process: import, load a lens, trace, gradient; and again with saved programs."""
+    """A new process that imports the package, loads a lens, traces it and computes a gradient;
+    without and with saved programs."""
     _, field, distance = config.scene
     rows = []
     for angle, where in ((0.0, "on axis"), (field, f"{config.field_deg:g} degrees")):
@@ -308,7 +321,7 @@ def first_task(config: Config) -> list[Row]:
     return rows
 
 
-# Functions of `Config`; "profile" has a job for each lens.
+# Tasks, as functions of `Config`; "profile" has a job for each lens.
 TASKS = {
     "spot": lambda config: spot_curves(config, False),
     "gradient": lambda config: spot_curves(config, True),

@@ -1,8 +1,8 @@
-"""Weak scaling of training over devices: each has as many images, whatever their number.
+"""Weak scaling of training over devices: the number of images per device is constant.
 
-On a CPU the devices are virtual (JAX_NUM_CPU_DEVICES=8) and share its cores: what is measured is
-the cost of sharing, not a gain. `carried_bytes` is what the devices add up in a step, as the
-compiled program says; a ring carries nearly twice that through each of its links.
+On a CPU the devices are virtual (JAX_NUM_CPU_DEVICES=8) and share its cores. The measurement then
+shows the overhead of several devices, not a gain. `carried_bytes` is the size of the all-reduces of
+a step in the compiled program; in a ring, nearly twice as much passes through each link.
 """
 
 import dataclasses
@@ -31,9 +31,9 @@ _BYTES = {"f32": 4, "f64": 8, "s32": 4}
 class Config:
     """Settings of the experiment; see configs/devices.yaml.
 
-    counts: of devices, the first 1.
-    images: of each device in a step. patch: side of an image, pixels.
-    repeats: turns in which the steps of all counts are timed.
+    counts: numbers of devices; the first is 1.
+    images: number of images of each device in a step. patch: side of an image, pixels.
+    repeats: number of turns in which the steps of all counts are timed.
     """
 
     counts: Annotated[tuple[int, ...], within(1, 4096), different] = (1, 2, 4, 8)
@@ -49,7 +49,11 @@ class Config:
 
 
 def run(config: Config, run: Run) -> dict[str, Any]:
-    """Times the steps of all counts, in turns."""
+    """Times the steps of all counts, in turns.
+
+    For each count, a step on this number of devices is compared with one of the same images on a
+    single device: times, and the relative difference of the losses.
+    """
     side = config.patch + train.Camera.kernel - 1
     shape = config.images * max(config.counts), side, side, 3
     scenes = np.random.default_rng(0).integers(0, 255, shape, np.uint8)
@@ -60,7 +64,7 @@ def run(config: Config, run: Run) -> dict[str, Any]:
     start = {"optics": {"sensor": lens.sensor}, "network": init(jax.random.key(0))}
 
     def step_of(count: int, mesh: Any) -> tuple[Callable[[], float], Any]:
-        """Function that takes a step with the images of `count` devices and returns its loss, and
+        """A function that runs a step with the images of `count` devices and returns its loss; and
         the lowered program."""
         imager = train.make_imager(blur, shared(restore, mesh, 1), train.Camera())
         begin, step = train.make_step(imager, {"optics": 1e-3, "network": 1e-3}, (25e3, 25e3), 0)
@@ -104,7 +108,7 @@ def tables(results: dict[str, Any]) -> dict[str, str]:
 
 
 def draw(results: dict[str, Any], figures: pathlib.Path) -> None:
-    """Draws the time of an image over the number of devices."""
+    """Draws the time per image over the number of devices."""
     rows = results["rows"]
     counts = [row["devices"] for row in rows]
     with _plots.picture(figures / "scaling.png", 6, 4) as (axes,):

@@ -1,10 +1,10 @@
-"""What each skip saves: the same answer with it and without, in turns, and the error of both.
+"""Time that each skip saves: the same result with it and without it, in turns, and both errors.
 
-A row is one skip, and each way a value that is passed, see `_skips`. `rows` hold `group`, `skip`,
-`error_of`, `factor` (time without / with) and `ways`, the way with the skip first: `words`,
-`quartiles_s`, `rays` traced in a call, `compile_s` and `error`, and `once_s`, which is taken before
-the first call. Errors are against a trace by Snell's law, exact sums or very many rays. Draws the
-factors and the errors.
+Each row is one skip. Its two ways differ in a value that is passed, see `_skips`. `rows` have
+`group`, `skip`, `error_of`, `factor` (time without / with) and `ways`, of which the first is that
+with the skip: `words`, `quartiles_s`, `rays` traced in a call, `compile_s`, `error`, and `once_s`,
+the time of the preparation before the first call. The reference is a trace by Snell's law, exact
+sums or very many rays. Draws the factors and the errors.
 """
 
 import dataclasses
@@ -28,10 +28,10 @@ from .runs.folder import Run
 class Skip(NamedTuple):
     """A row.
 
-    group: of rows.
+    group: name of a group of rows.
     name: what is skipped.
     ways: function of the settings that returns the `_skips.Way` with the skip and that without.
-    error_of: what errors are relative to.
+    error_of: quantity to which errors are relative.
     """
 
     group: str
@@ -64,16 +64,16 @@ SKIPS = {
 class Config:
     """Settings of the experiment; see configs/skips.yaml.
 
-    lens: centred, with circular apertures.
-    field_deg: of all rows but the first.
+    lens: a centred lens with circular apertures.
+    field_deg: field of all rows except the first.
     depths_m: nearest and farthest object of the row on depth.
     to: relative error of spot radii, from which orders follow.
     kernels_to: error of kernels, the sum over the pixels.
     generous: order of a rule that is not fitted to the lens.
-    random: random rays. rays: rays of a histogram.
-    planes: dead planes that are added.
+    random: number of random rays. rays: number of rays of a histogram.
+    planes: number of dead planes that are added.
     picture: pixels along the side of the small picture.
-    nodes: of its kernels, from the axis to the largest field.
+    nodes: number of nodes of its kernels, from the axis to the largest field.
     rows: names of the rows to run; empty for all.
     """
 
@@ -128,7 +128,7 @@ def _times(factor: float) -> str:
 
 
 def tables(results: dict[str, Any]) -> dict[str, str]:
-    """Two lines for each row: with the skip, and without."""
+    """A table with two lines for each row: with the skip, and without it."""
     lines: list[tuple] = []
     for (group,), rows in _common.grouped(results["rows"], "group").items():
         lines.append((f"**{group}**", *[""] * 7))
@@ -150,7 +150,7 @@ def tables(results: dict[str, Any]) -> dict[str, str]:
 
 
 def draw(results: dict[str, Any], figures: pathlib.Path) -> None:
-    """Draws bars of the factors, the largest first, and beside them the errors of both ways."""
+    """Draws bars of the factors, the largest first, and next to them the errors of both ways."""
     rows = sorted(results["rows"], key=lambda row: row["factor"])
     places = np.arange(len(rows))
     figure, (left, right) = show.new(1, 2, 5.6, 0.36 * len(rows) + 1.3)

@@ -1,6 +1,7 @@
-"""Randomly damaged prescriptions, lens files and settings: refused in one line, or right.
+"""Randomly damaged prescriptions, lens files and settings: each must raise an error of one line, or
+give a right result.
 
-Damage is done to bytes, to words, and to values of the YAML tree.
+The damage changes bytes, words, or values of the YAML tree.
 """
 
 import copy
@@ -24,7 +25,7 @@ from .runs import config as configs
 
 FAULTS = ("wrong", "traceback", "hang")
 OUTCOMES = ("refused", "survived", *FAULTS)
-# Most characters of a message; examples of faults that are kept for a kind.
+# Largest number of characters of a message, and of examples of faults for each kind.
 _LONGEST, _EXAMPLES = 300, 5
 _LENSES = pathlib.Path(drt_jax.__file__).parent / "lens" / "catalogue" / "lenses"
 # Lines of .zmx files that we do not write.
@@ -35,9 +36,10 @@ _ZMX = (
     *("OBSC 0 1", "CLAP 1 9", "OBDC 1 2", "FLAP", "GLAS MIRROR", "GLAS ___BLANK 1 0 1.6 40 0"),
     *("FNUM 2 1", "ENPD 5", "OBNA .1", "FTYP 2 0 1 1", "FTYP 1 1 3 9", "UNIT IN", "PWAV 9"),
 )
-# Files between clearings of JAX's caches: too many programs exhaust the maps of a process.
+# Number of files after which JAX's caches are cleared: too many compiled programs exceed the limit
+# of memory maps of a process.
 _KEPT = 200
-# Words that a careless or hostile author may write.
+# Words that a careless or malicious author may write.
 _WORDS = (
     *("0", "-1", "1e-320", "1e308", "-1e39", ".inf", "-.inf", ".nan", "nan", "inf", "null", "~"),
     *("true", "no", "''", "'0x10'", "0x10", "1:30", "2001-99-99", "1_000", "1e", "--5", "9" * 400),
@@ -52,7 +54,7 @@ _VALUES: tuple[Any, ...] = (
     *({"circle": 1}, {2: 1e-3}, {4: 1e30}, {"x1y1": 1}, 10**30, -(10**18), "x" * 500, 1e-7),
     *("asphere", "zernike", "qbfs", "toroid", "biconic", "polynomial_xy", "linear", "sensor"),
 )
-# Changes of a few bytes and of a value, as often as they stand here.
+# Changes of a few bytes and of a value; one that is listed more often is drawn more often.
 _OF_BYTES = ("remove", "double", "flip", "write a word", "write a word", "cut", "double a line")
 _OF_VALUES = ("exchange",) * 3 + ("scale",) * 2 + ("drop", "copy another", "rename")
 
@@ -99,7 +101,7 @@ def _places(node: Any) -> Iterator[tuple[Any, Any]]:
 
 
 def _change_value(content: bytes, rng: np.random.Generator) -> bytes:
-    """Changes one value of a YAML file, at any depth; nothing if the file is none any more."""
+    """Changes one value of a YAML file, at any depth; nothing if the file is no longer YAML."""
     kind = _one(_OF_VALUES, rng)
     try:
         tree = yaml.safe_load(content) if len(content) < 50_000 else None
@@ -126,8 +128,8 @@ def _change_value(content: bytes, rng: np.random.Generator) -> bytes:
 
 
 def row_of(kind: str, trials: Iterable[tuple[str, object]], count: int) -> dict[str, Any]:
-    """The row of a kind of trial for results.json. trials: outcome of each, and what to show of a
-    fault."""
+    """The row of a kind of trial for results.json. trials: outcome of each trial, and the text that
+    is shown for a fault."""
     counts, examples = dict.fromkeys(OUTCOMES, 0), list[str]()
     for outcome, example in tqdm(trials, kind, count, leave=False, dynamic_ncols=True):
         counts[outcome] += 1
@@ -146,7 +148,7 @@ class _TooLong(BaseException):
 
 
 def outcome_of(call: Callable[[], bool], seconds: float = 5.0) -> tuple[str, str]:
-    """Outcome and message of a call that returns True for a right result. seconds: most time."""
+    """Outcome and message of a call that returns True for a right result. seconds: time limit."""
 
     def ring(number: int, frame: Any) -> None:
         raise _TooLong
@@ -171,8 +173,8 @@ def outcome_of(call: Callable[[], bool], seconds: float = 5.0) -> tuple[str, str
 def _loaded(
     kind: str, path: pathlib.Path, content: Callable[[], bytes], count: int
 ) -> tuple[dict[str, Any], list[Lens]]:
-    """Row of files of random content, written to a path; and the lenses of those that load, which
-    must be finite."""
+    """Row of files with random content, which are written to a path; and the lenses of those that
+    load. Their numbers must be finite."""
     lenses = list[Lens]()
 
     def load() -> bool:
@@ -217,7 +219,7 @@ def lens_files(folder: pathlib.Path, count: int, rng: np.random.Generator) -> di
 
 
 def finite(lens: Lens) -> bool:
-    """True if all numbers of a lens are finite; apertures may be infinite, which is open."""
+    """True if all numbers of a lens are finite, except apertures, for which inf means open."""
     for path, leaf in jax.tree.leaves_with_path(lens):
         may_be_open = jax.tree_util.keystr(path) in (".semi_diameter", ".apertures.half")
         if np.any(np.isnan(leaf) if may_be_open else ~np.isfinite(leaf)):
@@ -248,8 +250,8 @@ def traced(lenses: list[Lens]) -> dict[str, Any]:
 
 
 def settings(path: pathlib.Path, count: int, rng: np.random.Generator) -> dict[str, Any]:
-    """Row of damaged settings of all experiments, written to a path, half of them by --set:
-    accepted ones must be the same when written and read again."""
+    """Row of damaged settings of all experiments, written to a path, half of them by --set.
+    Accepted settings must be the same after they are written and read again."""
     kinds = settings_files()
 
     def trials() -> Iterator[tuple[str, object]]:

@@ -1,8 +1,8 @@
-"""Runs that are killed, stopped or started twice resume to the results of an unbroken run, bit for
-bit.
+"""Runs that are killed, stopped or started twice: after --resume, their results must be those of an
+uninterrupted run, bit for bit.
 
-`python -m experiments._ended N SECONDS MODULE ...` runs `python -m MODULE ...` and kills it as it
-writes: SECONDS after the N-th time that it opens, renames or removes a file in the folder of --out.
+`python -m experiments._ended N SECONDS MODULE ...` runs `python -m MODULE ...` and kills it while
+it writes: SECONDS after it has opened, renamed or removed a file in the folder of --out N times.
 """
 
 import concurrent.futures
@@ -27,15 +27,16 @@ from ._damaged_files import clear, row_of
 # A short run that trains, writes metrics and checkpoints, and draws.
 _TOY = ("train.batches=40", "train.batch=2", "train.patch=16", "train.checkpoint_every=5")
 _TOY += ("camera.kernel=9", "data.crops_per_image=2", "starts_mm=[133.0, 134.0]")
-# Seconds after which a run counts as hung, and that an unbroken one takes; files that it touches.
+# Seconds after which a run counts as hung, and seconds of an uninterrupted run; number of times
+# that it opens, renames or removes a file.
 _PATIENCE, _WHOLE, _TOUCHES = 240.0, 6.0, 60
-_KILLS = 8  # kills of one run before it may end
+_KILLS = 8  # number of kills of one run before it runs to its end
 _SIGNALS = ((signal.SIGINT,), (signal.SIGTERM,), (signal.SIGINT, signal.SIGINT))
 
 
 class _Ended(NamedTuple):
-    """The end of a process. fault: "hang", "traceback" or ""; message: the last line of its text,
-    behind progress bars."""
+    """The end of a process. fault: "hang", "traceback" or "". message: the last line of its output,
+    without progress bars."""
 
     code: int
     fault: str
@@ -43,8 +44,8 @@ class _Ended(NamedTuple):
 
 
 class _Way(NamedTuple):
-    """A way to end a run: after some seconds by signals; or, with a touch above 0, by SIGKILL some
-    seconds after that touch of its folder."""
+    """A way to end a run: by signals after some seconds; or, with `touch` above 0, by SIGKILL some
+    seconds after it has touched files of its folder so many times."""
 
     seconds: float
     signals: tuple[signal.Signals, ...] = ()
@@ -52,7 +53,8 @@ class _Way(NamedTuple):
 
 
 def _start(folder: pathlib.Path, resume: bool = False, way: _Way | None = None) -> subprocess.Popen:
-    """Starts or resumes the toy run in a folder; with a `way` of touches one that kills itself."""
+    """Starts or resumes the toy run in a folder; with a `way` that counts touches, one that kills
+    itself."""
     touch = [__spec__.name, str(way.touch), str(way.seconds)] if way and way.touch else []
     module = [*touch, "experiments.focus", "--out", str(folder)]
     options = ["--resume"] if resume else ["--set", *_TOY]
@@ -73,13 +75,13 @@ def _end_of(process: subprocess.Popen) -> _Ended:
 
 
 def _result(folder: pathlib.Path) -> dict[str, Any]:
-    """Results of a run except the seconds, and its metrics."""
+    """Results of a run, without times, and its metrics."""
     results = json.loads((folder / "results.json").read_text())
     return results | {"seconds": None, "metrics.csv": (folder / "metrics.csv").read_text()}
 
 
 def _outcome(ended: _Ended, folder: pathlib.Path, truth: dict[str, Any]) -> tuple[str, str]:
-    """Outcome of a run that was not disturbed, and its message or what is wrong."""
+    """Outcome of a run that ended by itself, and its message or what is wrong."""
     if ended.fault:
         return ended.fault, ended.message
     if ended.code:
@@ -91,7 +93,7 @@ def _outcome(ended: _Ended, folder: pathlib.Path, truth: dict[str, Any]) -> tupl
 
 
 def _broken_off(folder: pathlib.Path, way: _Way) -> str:
-    """Resumes the run in a folder and ends it; returns what went wrong, "" for nothing."""
+    """Resumes the run in a folder and ends it; returns what went wrong, "" if nothing did."""
     process = _start(folder, (folder / "config.yaml").is_file(), way)
     if way.signals:
         time.sleep(way.seconds)
@@ -108,7 +110,12 @@ def _broken_off(folder: pathlib.Path, way: _Way) -> str:
 def rows(
     parent: pathlib.Path, count: int, rngs: list[np.random.Generator]
 ) -> Iterator[dict[str, Any]]:
-    """Rows of runs that are ended `count` times in all, and of runs that are started twice."""
+    """Rows of runs that are ended `count` times in all, and of runs that are started twice.
+
+    The reference is an uninterrupted run. A third of the ends are kills at random times, a third
+    kills at writes, the rest signals. Each run is ended up to `_KILLS` times before it is resumed
+    to its end, and two runs work at a time.
+    """
     whole, numbers = parent / "whole", itertools.count()
     ended = _end_of(_start(whole))
     if ended.code:
@@ -116,7 +123,8 @@ def rows(
     truth = _result(whole)
 
     def chain(ways: list[_Way]) -> list[tuple[str, str]]:
-        """Outcome of each way, after all of which one run is resumed to its end."""
+        """Outcome of each way. One run is ended in all ways, one after the other, and then resumed
+        to its end."""
         folder = parent / f"run {next(numbers)}"
         faults = [_broken_off(folder, way) for way in ways]
         ended = _end_of(_start(folder, resume=True))

@@ -1,4 +1,4 @@
-"""Families of random scenes made to break a ray tracer, each of one static structure."""
+"""Families of random scenes that are difficult for a ray tracer, each with one static structure."""
 
 import dataclasses
 import pathlib
@@ -40,13 +40,13 @@ Make = Callable[[np.random.Generator, int, Any], Scenes]
 
 
 class Family(NamedTuple):
-    """Scenes of a kind.
+    """Random scenes of one kind.
 
     what: description.
-    make: (generator, count, variant) -> scenes.
+    make: function (generator, count, variant) -> scenes.
     variants: variants, each with the same number of scenes.
     share: number of scenes relative to a family of full size.
-    needs: a folder without which there are no scenes.
+    needs: folder that the scenes need; without it there are none.
     """
 
     what: str
@@ -71,7 +71,7 @@ def elements(change: Callable | None = None, f_number: tuple = (1.4, 16), **scen
 
 
 def curvature(rng, parts, h, media):
-    """Zero or nearly zero; and nearly hemispherical."""
+    """Surfaces with a curvature of zero or nearly zero, and nearly hemispherical ones."""
     shape = parts["curvature"].shape
     tiny = rng.choice([0.0, -0.0, 1e-300, -1e-16, 1e-12, -1e-9, 1e-6], shape)
     steep = rng.choice([-1, 1], shape) * rng.uniform(0.8, 1.02, shape) / h[:, None]
@@ -88,7 +88,7 @@ def conic(rng, parts, h, media):
 
 
 def asphere(rng, parts, h, media):
-    """Terms of r^2 and r^4 that compensate each other."""
+    """Aspheres whose terms of r^2 and r^4 compensate each other."""
     shape, h = parts["conic"].shape, h[:, None]
     rim = h * rng.uniform(-0.1, 0.1, shape) * rng.random(h.shape) ** 2
     a4, a2 = rim / h**4, -rng.random(shape) * rim / h**2
@@ -96,14 +96,14 @@ def asphere(rng, parts, h, media):
 
 
 def index(rng, parts, h, media):
-    """Neighbours equal or nearly so, so that some lenses have almost no power."""
+    """Equal or nearly equal neighbouring indices, so that some lenses have almost no power."""
     near = 1 + rng.choice([0.0, 1e-12, 1e-9, 1e-6, 1e-4, 1e-2], media.shape)
     close = rng.random(media.shape) < 0.5
     media[:] = np.where(close, near * rng.choice([1.0, 1.5, 1.9], (len(h), 1)), media)
 
 
 def edge(rng, parts, h, media):
-    """Stops too wide for steep surfaces, and oblique light that leaves glass."""
+    """Stops too wide for steep surfaces, and oblique rays that leave glass."""
     h *= rng.uniform(1, 2.5, h.shape)
     slanted = rng.random(h.shape) < 0.3
     media[:, 0] = np.where(slanted, rng.uniform(1.4, 1.9, h.shape), media[:, 0])
@@ -120,7 +120,7 @@ def gaps(*sizes: float) -> Callable:
         for i in range(4):
             c[:, i + 1] = np.where(thickness[:, i] <= 1e-2, c[:, i], c[:, i + 1])
         back = rng.choice([*sizes, 1.0, 30.0], len(h))
-        flat = back < 0.1  # the sensor on the last surface
+        flat = back < 0.1  # the sensor touches the last surface
         c[:, 4] = np.where(flat, 0, c[:, 4])
         c[:, 3] = np.where(flat & (thickness[:, 3] <= 1e-2), 0, c[:, 3])
         sensor = np.sum(thickness, axis=1) + back + np.where(flat, 0, h)
@@ -150,7 +150,7 @@ def freeform(rng, parts, h, media):
 
 
 def focus(rng, count, stop):
-    """The sensor exactly at the paraxial focus; and stigmatic ellipsoids with a spot of 0."""
+    """Sensors exactly at the paraxial focus; and stigmatic ellipsoids with a spot of 0."""
     parts, h, media = two_elements(rng, count, stop, (1, 16))
     scenes = scenes_of(rng, parts, h, stop, media, (0, 5))
     last = np.sum(parts["thickness"], axis=1)
@@ -183,7 +183,7 @@ def mirror(rng, count, stop):
 
 
 def folded(rng, count, stop):
-    """A periscope of plane or weakly curved mirrors, the stop behind them."""
+    """Periscopes of plane or weakly curved mirrors, with the stop behind them."""
     h, reach = rng.uniform(2, 6, count), rng.uniform(20, 60, count)
     c = rng.choice([0.0, 1e-3, -1e-3], (count, 2))
     vertices, tilt = np.zeros((count, 5, 3)), np.zeros((count, 5, 3))
@@ -258,8 +258,8 @@ def offaxis(rng, count, stop):
 
 
 def camera(rng, count, name):
-    """A bundled lens changed by 3 %, with further aspheric terms of some um at the rim of the
-    stop."""
+    """A bundled lens with its numbers changed by 3 %, and additional aspheric terms of some um at
+    the rim of the stop."""
     lens = drt_jax.load_lens(name)
     surfaces = lens.count
     batch = jax.tree.map(lambda a: np.broadcast_to(a, (count, *a.shape)), lens)

@@ -14,14 +14,14 @@ def _unit(v):
 
 
 def conic_mirror(d, e, near, far):
-    """Conic mirrors that turn a ray from the unit vector d to e, (N, 3), and image a source `near`
-    away to a point `far` away along it; `near` and `far` are vergences 1 / distance, 1/mm, (N,): 0
-    for parallel light, below 0 for a virtual source or image.
+    """Conic mirrors that turn a ray from the unit vector d to e, (N, 3), and image a source on the
+    ray to a point on the ray. `near` and `far` are the vergences 1 / distance of both from the hit,
+    1/mm, (N,): 0 for parallel light, below 0 for a virtual source or image.
 
     Returns curvatures, conic constants and curvatures across the plane of incidence (of toroids),
-    (N,); the axes, and the vertices as seen from the hit, mm, (N, 3); and the cosines of the
-    normals at the hit with the axes, (N,). Normals and axes point forwards along the light. Both
-    foci lie on the axis, which runs along near e + far d.
+    (N,); the axes, and the vertices relative to the hit, mm, (N, 3); and the cosines of the angles
+    between the normals at the hit and the axes, (N,). Normals and axes point forwards along the
+    light. Both foci lie on the axis, which has the direction near e + far d.
     """
     turn, along = 1 - np.sum(d * e, -1), near[:, None] * e + far[:, None] * d
     c, k = -(near + far) / turn, -np.sum(along**2, -1) / (near + far) ** 2
@@ -34,15 +34,15 @@ def conic_mirror(d, e, near, far):
 
 
 def local_mirror(d, e, near, far):
-    """As `conic_mirror`, but spheres, or toroids, with their vertices at the hit: 2 / R is
-    power * cosine in the plane of incidence and power / cosine across it (Coddington)."""
+    """As `conic_mirror`, but spheres, or toroids, with their vertices at the hit. By Coddington's
+    equations, 2 / R is power * cosine in the plane of incidence and power / cosine across it."""
     normal = _unit(d - e)
     cosine, c = np.sum(d * normal, -1), -(near + far) / 2
     return c * cosine, 0 * c, c / cosine, normal, 0 * d, 0 * c + 1
 
 
 def _across(rng, d):
-    """Random unit vectors across unit vectors d, (N, 3)."""
+    """Random unit vectors perpendicular to unit vectors d, (N, 3)."""
     v = rng.normal(size=d.shape)
     return _unit(v - d * np.sum(v * d, -1, keepdims=True))
 
@@ -60,8 +60,8 @@ class _Rows:
     rows: list = dataclasses.field(default_factory=list)
 
     def add(self, point, axis, c=0.0, k=0.0, across=0.0, mirror=False):
-        """A row with its vertex at `point`, mm, and its axis along the unit vector `axis`, (N, 3);
-        a plane by default."""
+        """Adds a row with its vertex at `point`, mm, and its axis along the unit vector `axis`,
+        (N, 3); a plane by default."""
         flat = np.zeros(len(point))
         tilt = np.arctan2(-axis[:, 1], axis[:, 2]), np.arcsin(np.clip(axis[:, 0], -1, 1)), flat
         self.rows.append((mirror, flat + c, flat + k, flat + across, point, np.stack(tilt, -1)))
@@ -84,14 +84,15 @@ class _Rows:
 
 
 class Walk(NamedTuple):
-    """A maker (see `Family`) of mirrors along a chief ray. Variants are (number of mirrors, whether
-    the stop is a plane between the first two instead of in front of all).
+    """A function `make` of `Family` for mirrors along a chief ray. Variants are (number of mirrors,
+    True if the stop is a plane between the first two mirrors, False for one in front of all).
 
-    mirror: `conic_mirror` or one like it.
+    mirror: `conic_mirror` or `local_mirror`.
     turns: smallest and largest angle by which a mirror turns the beam, degrees.
-    parallel: True for light from a focus to parallel light and back, False for foci anywhere.
-    width: largest semi-diameter of the beam over the distance of the mirrors.
-    least: least cosine of the normal at the chief ray with the axis of its mirror.
+    parallel: True for mirrors from a focus to parallel light and back, False for foci anywhere.
+    width: largest semi-diameter of the beam, divided by the distance between the mirrors.
+    least: smallest cosine of the angle between the normal at the chief ray and the axis of the
+        mirror.
     form: "toroid" for toroids, which turn the beam in the plane of y and z.
     """
 
@@ -103,12 +104,17 @@ class Walk(NamedTuple):
     form: str | None = None
 
     def _turned(self, rng, d):
-        """Random directions behind mirrors that light meets along d, (N, 3)."""
+        """Random directions behind mirrors for light of the direction d, (N, 3)."""
         angle = np.radians(rng.uniform(*self.turns, (len(d), 1)))
         flat = np.stack([0 * d[:, 0], d[:, 2], -d[:, 1]], -1) * rng.choice([-1, 1], angle.shape)
         return np.cos(angle) * d + np.sin(angle) * (flat if self.form else _across(rng, d))
 
     def __call__(self, rng, count, variant):
+        """`count` scenes that fit, of 200 times as many random ones.
+
+        From mirror to mirror it follows the chief ray (`point`, direction `d`), the vergence `near`
+        of the source for the next mirror, and the size of the beam there.
+        """
         mirrors, between = variant
         n, rows = 200 * count, _Rows(self.form)
         reach = rng.uniform(20, 80, n)
@@ -126,7 +132,7 @@ class Walk(NamedTuple):
                 image = np.where(near == 0, abs(image), 0)
             c, k, across, axis, vertex, cosine = self.mirror(d, e, near, image)
             fits &= (cosine > self.least) & (np.linalg.norm(vertex, axis=-1) < 30 * reach)
-            # No ray of the beam, and no field, may come from behind a grazing mirror.
+            # No ray of the beam, at any field, may come from behind a grazing mirror.
             angle = np.linalg.norm(d - e, axis=-1) / 2
             fits &= size * np.maximum(abs(near), abs(image)) < angle / 2
             widest = np.minimum(widest, np.degrees(angle) / 4)
@@ -149,10 +155,13 @@ class Walk(NamedTuple):
 
 
 def relay(rng, count, name):
-    """Relays at unit magnification, their object beside the common centre of all spheres and in the
-    middle of the field, because all surfaces are decentred: the Offner relay, a concave mirror, the
-    stop on a convex one of half its radius and the first again; and that of Dyson, a block of glass
-    with one sphere in front of a concave mirror, which is the stop. Off by a few per mille."""
+    """Offner and Dyson relays at unit magnification, with numbers changed by a few per mille.
+
+    Offner: a concave mirror, the stop on a convex mirror of half its radius, and the first mirror
+    again. Dyson: a block of glass with one sphere in front of a concave mirror, which is the stop.
+    The object lies at some distance from the common centre of all spheres. All surfaces are
+    decentred, so that it is in the middle of the field.
+    """
     large, one = rng.uniform(50, 300, count), np.ones(count)
     turn, aside = rng.uniform(0, 2 * np.pi, count), large * rng.uniform(0.02, 0.15, count)
     n = rng.uniform(1.4, 1.9, count)

@@ -3,9 +3,9 @@
 No Fermat solver and no aiming: the integral over the stop uses the coordinates q in which a ray
 crosses a plane in front of the lens, with the Jacobian |dp/dq| of its stop point p by Snell's law.
 The region of integration is the part of that plane from which rays pass the stop and the clear
-apertures. Bisection along half-lines from a point inside finds its edge. Where two apertures meet,
-the edge has a corner and a panel of Gauss nodes ends. Derivatives are by automatic differentiation
-of the trace; the edge follows the lens.
+apertures. Its edge is found by bisection along half-lines from a point inside. Where the limiting
+aperture changes, the edge has a corner, at which a panel of Gauss nodes ends. Derivatives are by
+automatic differentiation of the trace, and include the motion of the edge.
 """
 
 import dataclasses
@@ -136,7 +136,8 @@ class Region(NamedTuple):
 
     def half_lines(self, nodes: int = _AZIMUTHS) -> tuple[Array, Array, Array]:
         """Azimuths and widths of Gauss nodes over the half with x > 0, and the number of corners.
-        Panels, of so many nodes, end at the corners; with fewer than `_CORNERS` some are empty."""
+        Panels of `nodes` nodes end at the corners; if there are fewer than `_CORNERS`, some panels
+        are empty."""
         corners, count = self._corners()
         even = jnp.linspace(-jnp.pi / 2, jnp.pi / 2, _PANELS + 1)
         edges = jnp.sort(jnp.concatenate([even, corners]))
@@ -156,8 +157,9 @@ def heights_within(excess: Callable[[Array], Array], reach: Array) -> tuple[Arra
 
 
 def _line(region: Region, azimuth: Array, varied: Lens, scene: Array) -> tuple[Array, Array]:
-    """Spots (R, 2), mm, and areas (R,) of the nodes of a half-line. The edge follows `varied`, the
-    lens of which derivatives are taken, by one Newton step."""
+    """Hits (R, 2) on the sensor, mm, and areas (R,) of the nodes of a half-line. One Newton step
+    gives the edge its derivatives by `varied`, the lens with respect to which derivatives are
+    taken."""
     radius, aperture = region.edge(azimuth)
     along = partial(region.point, azimuth)
     slope = jax.jvp(lambda r: region.excess(along(r)), (radius,), (jnp.ones_like(radius),))[1]
@@ -192,7 +194,7 @@ def _integral(
         spot, area = jax.vmap(lambda angle: _line(region, angle, varied, scene))(azimuth)
         area = area * width[:, None]
         area = area / jnp.sum(area)
-        # The other half is the mirror image in x. A sum of small numbers rounds less.
+        # The other half is the mirror image in x. A sum of small numbers has less rounding error.
         height = jax.lax.stop_gradient(spot[0, 0, 1])
         mean = height + jnp.sum(area * (spot[..., 1] - height))
         square = spot[..., 0] ** 2 + (spot[..., 1] - mean) ** 2
@@ -211,7 +213,7 @@ def _integral(
 def beyond(lens: Lens, field: float) -> float:
     """`reach` of a `Region`, mm."""
     semi = np.asarray(lens.semi_diameter)
-    # A steep beam crosses the plane far from its hits on the first surface.
+    # An oblique beam crosses the plane far from its hits on the first surface.
     return (3 * float(np.max(semi[np.isfinite(semi)])) + 2 * LEAD) * (1 + math.tan(abs(field)))
 
 
@@ -223,7 +225,7 @@ def reference(
     field: angle along y, radians.
     distance: distance of the object, mm.
     wavelengths: wavelengths, um.
-    slopes: False to leave out the derivatives, which are NaN then.
+    slopes: False to leave out the derivatives, which are then NaN.
     """
     reach, rows = beyond(lens, field), []
     for wavelength in wavelengths:
@@ -253,9 +255,11 @@ def relative_error(truth: Moments, sigma: Any) -> float:
 def gradient_error(
     exact: np.ndarray, slopes: np.ndarray, surfaces: int, known: np.ndarray | bool = True
 ) -> float:
-    """Norm of the error of a gradient (..., P) over that of the truth, the worse of that by
-    curvatures of `surfaces` surfaces and that by distances; NaN if the truth is 0. known: (..., P),
-    bool, derivatives that count."""
+    """Norm of the error of a gradient (..., P) divided by the norm of the exact gradient.
+
+    It is the larger of the values for the curvatures of `surfaces` surfaces and for the distances;
+    NaN if the exact gradient is 0. known: (..., P), bool, derivatives that are compared.
+    """
     wrong, truth = np.where(known, slopes - exact, 0), np.where(known, exact, 0)
     groups = slice(0, surfaces), slice(surfaces, None)
     norms = [(np.linalg.norm(wrong[..., g]), np.linalg.norm(truth[..., g])) for g in groups]

@@ -58,8 +58,8 @@ def batch_of(parts, h, stop, media=None, **static):
 
 
 def placed(vertices, tilt):
-    """The `parts` of `batch_of` that place surfaces and the sensor: vertices (N, S + 1, 3), mm, and
-    tilts (N, S + 1, 3), radians."""
+    """The `parts` of `batch_of` for the positions of surfaces and sensor: vertices (N, S + 1, 3),
+    mm, and tilts (N, S + 1, 3), radians."""
     z = vertices[..., 2]
     parts = {"thickness": np.diff(z)[:, :-1], "sensor": z[:, -1] - z[:, 0]}
     return parts | {"tilt": tilt, "decentre": vertices[..., :2]}
@@ -111,7 +111,7 @@ def scenes_of(rng, parts, h, stop, media=None, angles=(0, 15), distances=_FAR, *
     """Scenes with lenses of `batch_of`.
 
     angles: smallest and largest field, degrees; a tenth of the fields is 0.
-    distances: distances to draw from, mm.
+    distances: distances from which one is drawn for each scene, mm.
     """
     count = len(h)
     field = fields(rng, count, *angles)

@@ -1,5 +1,5 @@
-"""Situations that outside trials found, as families of random scenes: immersion, virtual objects
-and images, collimated light, and lenses of other people's files."""
+"""Situations of docs/trials.md as families of random scenes: immersion, virtual objects and images,
+collimated light, and lenses from files of other programs."""
 
 import contextlib
 import warnings
@@ -15,7 +15,7 @@ import drt_jax
 from ._common import ROOT
 from ._scenes import WAVELENGTH, Scenes, batch_of, fields, pupil_points, scenes_of, two_elements
 
-# Lens files beside a checkout; they are not part of it.
+# Folder of lens files next to a checkout; it is not part of it.
 FILES = ROOT.parent / "shared" / "data" / "lens_files"
 _SHAPE = "curvature", "conic", "coefficients"
 
@@ -36,12 +36,13 @@ def paraxial(lens, distance):
 
 
 class Conjugate(NamedTuple):
-    """A maker (see `Family`) of lenses of `two_elements` whose object stands at a place of its own.
+    """A function `make` of `Family` for lenses of `two_elements` with chosen object distances.
 
-    place: (generator, distance of the front focus in front of the first vertex, semi-diameters of
-        the stop), (N,), mm -> distances of the object, mm; NaN for a lens that is not used.
-    virtual: share of the sensors that stand at a virtual image, where there is one; with 1 lenses
-        without one are not used. Other sensors stand anywhere behind the lens.
+    place: function (generator, distance of the front focus in front of the first vertex,
+        semi-diameters of the stop), (N,), mm -> distances of the object, mm; NaN for a lens that
+        is not used.
+    virtual: share of the sensors that are placed at a virtual image, if there is one; with 1,
+        lenses without one are not used. Other sensors are anywhere behind the lens.
     """
 
     place: Callable
@@ -67,7 +68,7 @@ class Conjugate(NamedTuple):
 
 
 def far_away(rng, front, h):
-    """An object at infinity or some lengths of the lens away."""
+    """An object at infinity, or at some lengths of the lens."""
     return rng.choice([np.inf, 1e3, 200.0], len(h))
 
 
@@ -82,7 +83,7 @@ def at_focus(rng, front, h):
 
 
 def behind_vertex(rng, front, h):
-    """Light that converges to a point inside or behind the lens."""
+    """A virtual object: light converges to a point inside or behind the lens."""
     return -h * rng.uniform(1, 20, len(h))
 
 
@@ -106,7 +107,7 @@ def _read(path):
         lens, field = system.lens, np.asarray(system.scene.field)
         if any(lens.mirrors) or lens.elements or lens.phase or lens.tilt is not None:
             return None
-        # Planes that bend no light become surfaces as others here, which may not touch.
+        # Planes that bend no light are treated as surfaces here, which may not touch.
         kept = sorted({*lens.active, lens.stop})
         z = np.append(np.asarray(lens.vertices)[kept], lens.sensor)
         if np.min(np.diff(z)) < 1e-3:
@@ -122,9 +123,12 @@ def _read(path):
 
 
 def _padded(row, stop, surfaces, terms):
-    """Arrays of a `_Row` with planes that bend no light, where no surface bulges into them: in
-    front, from two radii of the stop on, and behind, in the last tenth of the way to the sensor.
-    The stop then has the index `stop` of `surfaces`."""
+    """Arrays of a `_Row`, padded to `surfaces` surfaces with planes that bend no light. The stop
+    then has the index `stop`.
+
+    The planes are where no surface reaches: more than two radii of the stop in front of the lens,
+    and in the last tenth of the distance to the sensor.
+    """
     front, old = stop - row.stop, len(row.media) - 1
     back = surfaces - old - front
     rows = {}
@@ -141,8 +145,9 @@ def _padded(row, stop, surfaces, terms):
 
 
 def files(rng, count, _):
-    """Lenses of the files of `FILES`, without mirrors, gratings and rims, their curvatures and gaps
-    changed by 3 %. Planes that bend no light make them alike, so that one program serves all."""
+    """Lenses of the files of `FILES`, without mirrors, gratings and rims; their curvatures and gaps
+    are changed by 3 %. Planes that bend no light pad them to one structure, so that all share one
+    compiled program."""
     found = [row for path in sorted(FILES.glob("*.zmx")) if (row := _read(path))]
     stop = max(row.stop for row in found)
     surfaces = stop + max(len(row.media) - 1 - row.stop for row in found)

@@ -45,7 +45,7 @@ def _over_scenes(function: Callable) -> Callable:
 
 
 def _sum(a):
-    """A sum with fixed weights between 1/2 and 3/2, all different."""
+    """A sum with fixed, different weights between 1/2 and 3/2."""
     weights = 1 + np.sin(1 + np.arange(a.size, dtype=float)).reshape(a.shape) / 2
     return jnp.sum(jnp.asarray(weights, a.dtype) * a)
 
@@ -67,9 +67,9 @@ def _entering(point, field, distance):
 
 
 def _residual(lens, field, distance, pupil, points):
-    """Residual of the traced points (S + 1, 3) of a ray as a stationary path through its stop
-    point, over the bound of rounding: `_ROUNDINGS / 5` times the change by the last digit of a
-    coordinate.
+    """Residual of the equations of a stationary path through the stop point, at the traced points
+    (S + 1, 3) of a ray, divided by the bound for rounding: `_ROUNDINGS / 5` times the change by the
+    last digit of a coordinate.
 
     Along a stationary path, n e - n' e' is normal to each active surface, with the directions e and
     e' and the indices n and n' in front of and behind it.
@@ -117,8 +117,8 @@ def _rays(lens, field, distance, pupil):
 
 @_over_scenes
 def _moments(lens, field, distance):
-    """Moments and the derivatives of a sum of them by lens and scene; 0 for the infinite covariance
-    of a wavelength of which no light passes."""
+    """Moments, and the derivatives of a sum of them by lens and scene. The infinite covariance of a
+    wavelength without light counts as 0."""
     wavelength = jnp.full(1, WAVELENGTH, field.dtype)
 
     def scalar(lens, field, distance):
@@ -135,20 +135,24 @@ def _shoot(lens, field, distance, point):
     """Sequential trace of the ray through a point (3,) in front of the lens."""
     direction = _entering(point, field, distance)
     wavelength, size = jnp.asarray(WAVELENGTH, point.dtype), jnp.linalg.norm(direction)
-    begun = jnp.where(distance > 0, size * distance, jnp.inf)  # a virtual object is no beginning
+    begun = jnp.where(distance > 0, size * distance, jnp.inf)  # inf for a virtual object
     return trace_snell(lens, wavelength, point, direction / size, begun)
 
 
 @_over_scenes
 def _retrace(lens, field, distance, points):
-    """Difference of the points (RAYS, S + 1, 3) of each ray from a sequential trace through the
-    first of them: relative to their size and to the growth of a shift of the start; in mm, 0 if
-    that trace fails; and whether it fails, and its four neighbours all arrive or all fail (at the
-    edge of the beam, where some do, either may be right)."""
+    """Compares the points (RAYS, S + 1, 3) of each ray with a sequential trace through the first
+    point.
+
+    Returns the difference relative to the size of the points and to the growth of a shift of the
+    start; the difference in mm, 0 if the sequential trace fails; and whether it fails while its
+    four neighbours all arrive or all fail. (At the edge of the beam, where only some neighbours
+    arrive, both results may be right.)
+    """
 
     def one(points):
         size = 1 + jnp.max(jnp.abs(points))
-        shift = 1e-7 * size * jnp.eye(3, k=-1)[jnp.array([0, 1, 2, 1, 2])]  # not, in x, in y
+        shift = 1e-7 * size * jnp.eye(3, k=-1)[jnp.array([0, 1, 2, 1, 2])]  # unshifted, x, y
         shift = shift * jnp.array([[0.0], [1], [1], [-1], [-1]], shift.dtype)
         hits, ok = jax.vmap(lambda s: _shoot(lens, field, distance, points[0] + s))(shift)
         growth = jnp.max(jnp.abs(hits[1:] - hits[:1])) / (1e-7 * size)
@@ -161,7 +165,7 @@ def _retrace(lens, field, distance, points):
 
 @_over_scenes
 def _search(lens, field, distance, pupil):
-    """True where a ray by Snell's law passes a stop point, (RAYS,).
+    """True where a sequential trace finds a ray through a stop point, (RAYS,).
 
     Newton's method with halving starts from the nearest rays of a grid over the first surface. A
     ray counts if it meets the stop point within `_STOP_MISS` and its neighbours reach the sensor.
@@ -176,7 +180,7 @@ def _search(lens, field, distance, pupil):
         def step(_, state):
             trial, best, last, found = state
             h = 1e-7 * (1 + jnp.max(jnp.abs(trial)))
-            at, ok = jax.vmap(crossing)(trial[None] + h * jnp.eye(3, 2, k=-1))  # not, in x, in y
+            at, ok = jax.vmap(crossing)(trial[None] + h * jnp.eye(3, 2, k=-1))  # unshifted, x, y
             miss = jnp.linalg.norm(at[0] - target)
             better = ok[0] & (miss <= best)
             newton = jnp.linalg.solve((at[1:] - at[:1]).T / h, target - at[0])
@@ -204,7 +208,7 @@ def _search(lens, field, distance, pupil):
 
 
 def _infinite(*found: Any) -> np.ndarray:
-    """Numbers that are not finite, by scene."""
+    """Count of numbers that are not finite, for each scene."""
     leaves = [~np.isfinite(leaf) for leaf in jax.tree.leaves(found)]
     return np.sum([np.sum(bad, axis=tuple(range(1, bad.ndim))) for bad in leaves], axis=0)
 
@@ -219,7 +223,7 @@ def survey(scenes: Scenes) -> dict[str, np.ndarray]:
     good = reaches_sensor(status)
     relative, off, denied = _retrace(*exact[:3], rays.points[:, 0].astype(float))
     ratio = relative / np.finfo(dtype).eps
-    # Scenes rounded to float32, in both precisions.
+    # The scenes are rounded to float32, and traced in both precisions.
     rough, single = scenes, rays
     if dtype != np.float32:
         rough = jax.tree.map(lambda a: np.float32(a[::_BOTH]), scenes)

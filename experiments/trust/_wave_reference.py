@@ -1,20 +1,21 @@
 """Diffraction transfer functions and images from the sequential trace alone, for an object at
 infinity.
 
-Huygens' waves start from a sphere through the paraxial exit pupil about the centroid C of the spot,
-with the radius R. A ray crosses it at S, after the optical path L, and is there a wave towards C
-with the direction cosines d = n (C - S) / R:
+Huygens' waves start from a sphere of the radius R about the centroid C of the spot, through the
+paraxial exit pupil. A ray crosses the sphere at S, after the optical path L. There it contributes a
+wave towards C with the direction cosines d = n (C - S) / R:
 
     field(x) = integral of P exp(ik (L + n |x - S|)) dd,
     OTF(f) = integral of Q(d + s / 2) conj(Q(d - s / 2)) dd / integral of P^2 dd,  s = f wavelength,
 
-where Q = P exp(ik (L - d.C)) takes n |x - S| as n R + d.(x - C), as every pupil function does.
-Light fills the stop evenly, P^2 = |dp / dd|, or the beam in front of the lens, P^2 = |dq / dd|:
-with aberrations of the pupil these differ. Results are for both, in this order.
+where Q = P exp(ik (L - d.C)) uses the approximation n |x - S| = n R + d.(x - C) of all pupil
+functions. Light fills evenly either the stop, P^2 = |dp / dd|, or the beam in front of the lens,
+P^2 = |dq / dd|; with pupil aberrations these differ. Results are for both, in this order.
 
-Both integrals are over the coordinates q of `_reference`, so nothing is aimed at the stop and no
-pupil is a grid; d + s / 2 and d - s / 2 are found by Newton's method. The region of integration,
-where both rays pass, has corners, at which panels of Gauss nodes end.
+Both integrals are over the coordinates q of `_reference`, so that no ray is aimed at the stop and
+the pupil is not sampled by a grid. The rays of d + s / 2 and d - s / 2 are found by Newton's
+method. The region of integration, where both rays pass, has corners, at which panels of Gauss nodes
+end.
 """
 
 from collections.abc import Sequence
@@ -34,14 +35,14 @@ from .snell import QUICK, trace_snell
 
 _UM = 1e3  # per mm
 _NEWTON = 6
-_RADII, _AZIMUTHS = 64, 24  # nodes: phases turn by many periods over the pupil
-_POINTS = 512  # of an image, at a time
+_RADII, _AZIMUTHS = 64, 24  # nodes: phases change by many periods over the pupil
+_POINTS = 512  # points of an image that are computed at a time
 
 
 class _Light(NamedTuple):
     """A lens and the light through it.
 
-    scene: as of `_reference`, an object at infinity.
+    scene: as in `_reference`, with an object at infinity.
     centre: (3,), C, mm. radius: (), R, mm.
     """
 
@@ -71,7 +72,8 @@ class _Wave(NamedTuple):
 
 
 def _ray(of: _Light, q: Array) -> tuple[Array, tuple[Array, Array, Array]]:
-    """Stop point and direction, (4,); the direction again, path and place on the sphere."""
+    """Stop point and direction, (4,), to be differentiated; and direction, path and position on the
+    sphere."""
     field, _, wavelength = of.scene
     start = jnp.append(q, -LEAD)
     along = jnp.stack([0 * field, jnp.sin(field), jnp.cos(field)])
@@ -94,7 +96,8 @@ def _wave(of: _Light, q: Array) -> _Wave:
 
 
 def _turned(of: _Light, q: Array, by: Array) -> tuple[Array, Array]:
-    """q of the ray whose direction is that at q plus `by`, (2,), and by how much it is missed."""
+    """q of the ray whose direction differs by `by`, (2,), from that of the ray at q; and the
+    remaining error of its direction."""
 
     def ray(q):
         direction = _ray(of, q)[0][2:]
@@ -112,8 +115,12 @@ def _turned(of: _Light, q: Array, by: Array) -> tuple[Array, Array]:
 
 @partial(jit, wanted=QUICK)
 def _overlap(of: _Light, reach: Array, shear: Array, part: float) -> tuple[Array, Array]:
-    """The integrals of P conj(P) of pupils that differ by `shear`, (2,), along one axis, (2, 2),
-    [real and imaginary, light]; and the number of corners. part: as in `_reference`."""
+    """Autocorrelation of the pupil function at a shear.
+
+    shear: (2,), difference of the directions, along one axis. part: as in `_reference`.
+
+    Returns the integrals (2, 2), [real and imaginary, light], and the number of corners.
+    """
 
     def ends(q):
         return [_turned(of, q, by) for by in (shear / 2, -shear / 2)]
@@ -147,15 +154,15 @@ def _overlap(of: _Light, reach: Array, shear: Array, part: float) -> tuple[Array
         return jnp.sum(jax.vmap(node)(jnp.asarray(1 + t) / 2, jnp.asarray(weight)), axis=0)
 
     half = jnp.tensordot(width, jax.vmap(line)(azimuth), 1)
-    # In the mirror image in x a shear along x changes its sign, and the integral is conjugated.
+    # The mirror image in x changes the sign of a shear along x, which conjugates the integral.
     both = jnp.stack([jnp.ones_like(reach), jnp.where(shear[0] == 0, 1.0, 0.0)])
     return 2 * half * both[:, None], corners
 
 
 @partial(jit, wanted=QUICK)
 def _nodes(of: _Light, reach: Array, part: float) -> tuple[_Wave, Array, Array]:
-    """The pupil function at nodes of half of the pupil, their areas of q, and the heights of their
-    hits on the sensor."""
+    """The pupil function at nodes of half of the pupil, the areas of the nodes in q, and the
+    heights of their hits on the sensor."""
     excess = partial(outside_of, of.lens, of.scene)
     low, high, _ = heights_within(excess, reach)
     region = Region(excess, low + part * (high - low), reach)
@@ -189,7 +196,7 @@ def transfer(
     lens: Lens, field: float, wavelength: float, frequencies: Sequence[float]
 ) -> tuple[np.ndarray, float]:
     """Modulus of the transfer functions of a centred lens, (2, 2, N), [light, tangential and
-    sagittal], and the largest change with other nodes.
+    sagittal], and the largest change when other nodes are used.
 
     field: angle along y, radians. wavelength: um. frequencies: cycles/mm.
     """
@@ -206,8 +213,9 @@ def transfer(
 def image(
     lens: Lens, field: float, wavelength: float, places: np.ndarray
 ) -> tuple[np.ndarray, float]:
-    """Irradiance (2, N), [light], at places (N, 2) on the sensor, mm, 1/mm^2 of all the light; and
-    the largest change with other nodes, relative to the peak. Arguments as of `transfer`."""
+    """Irradiance (2, N), [light], at `places` (N, 2) on the sensor, mm, in 1/mm^2 of all light; and
+    the largest change when other nodes are used, relative to the peak. Other arguments as in
+    `transfer`."""
     (of, reach), found = _light(lens, field, wavelength), []
     index, wave_number = float(lens.index(of.scene[2:])[-1, 0]), float(of.wave_number)
     for part in (0.5, 0.57):

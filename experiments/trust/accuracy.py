@@ -1,15 +1,18 @@
 """Run time against error of the spot size, its gradient and the centroid.
 
-Compares our quadrature of rising order with the patterns of other programs, traced by the same
+Compares our quadrature of increasing order with the patterns of other programs, traced by the same
 code: random rays (also the paper's 256), a square grid, hexapolar rings and the Sobol sequence.
-The truth is an integral over the sequential Snell trace. Writes results.json, whose `curves` has
-a row for each scene, method and number of rays, and draws error over time and over rays.
+The reference is an integral over the sequential trace by Snell's law. Writes results.json, whose
+`curves` has a row for each scene, method and number of rays, and draws error over time and over
+rays. Columns of a row:
 
-relative_error: of the RMS spot radius sigma, the worst wavelength. centroid_error: distance of the
-centroids over sigma, the worst wavelength. gradient_error: of the derivatives of sigma (mean of
-the wavelengths) by all curvatures, and by all thicknesses and the sensor position: the norm of the
-difference over that of the reference, the worse of the two groups. seconds: median time of a
-compiled call; gradient_seconds: of a call with gradients in reverse mode.
+relative_error: relative error of the RMS spot radius sigma, for the worst wavelength.
+centroid_error: distance of the centroids divided by sigma, for the worst wavelength.
+gradient_error: error of the derivatives of sigma (mean over the wavelengths) by all curvatures, and
+    by all thicknesses and the sensor position: norm of the difference divided by that of the
+    reference, for the worse of the two groups.
+seconds: median time of a compiled call.
+gradient_seconds: the same for a call with gradients in reverse mode.
 """
 
 import dataclasses
@@ -35,7 +38,7 @@ from ._reference import Moments, flatten, gradient_error, reference, relative_er
 from .runs.folder import Run
 
 _QUADRATURE = "quadrature"
-# In the table: the default tolerance, and the sizes of patterns.
+# For the table: the default tolerance, and the sizes of patterns.
 _DEFAULT, _RANDOM, _MANY = 1e-6, 256, 16384
 _SIZES = (16, 64, 256, 1024, 4096, 16384)
 _order, _rays = within(1, 40), within(7, 1e7)  # one hexapolar ring has 7 rays
@@ -48,10 +51,10 @@ class AccuracyScene:
     lens: bundled name or YAML path.
     field_deg: field angle of the object.
     distance_m: distance of the object, .inf for infinity.
-    defocus_mm: sensor position less that of the best focus on axis at the distance.
-    front_mm, rear_mm: semi-diameters of the first and last surface, 0 for the lens's own.
-    orders: orders instead of those of the run.
-    most_rays: largest pattern.
+    defocus_mm: sensor position minus that of the best axial focus for the distance.
+    front_mm, rear_mm: semi-diameters of the first and last surface; 0 for those of the lens.
+    orders: orders for this scene, instead of those of the run.
+    most_rays: number of rays of the largest pattern.
     """
 
     lens: str = "double_gauss"
@@ -71,7 +74,7 @@ class AccuracyScene:
 
     @property
     def kind(self) -> tuple:
-        """Scenes of a kind follow each other and share programs."""
+        """Key of scenes that are measured one after the other and share compiled programs."""
         return self.lens, self.dtype, self.vignetted
 
     @property
@@ -107,7 +110,7 @@ class Config:
 
     orders: orders of the quadrature.
     rays: nominal sizes of the patterns.
-    seeds: number of random patterns, of which the median counts.
+    seeds: number of random patterns, whose median error is reported.
     tolerances: tolerances of the rules that are tested.
     """
 
@@ -142,8 +145,8 @@ def spot_and_gradients(lens: Lens, *rest: Any) -> tuple[tuple[Array, Array], Arr
 
 
 def patterns(rays: int, seeds: int, dtype: Any) -> dict[str, list[PupilRule]]:
-    """Patterns of other programs by method, of at most `rays` points, padded with weightless ones
-    so that all share a program; `seeds` random ones."""
+    """Patterns of other programs by method, with at most `rays` points. They are padded with points
+    of weight 0, so that all share a compiled program. There are `seeds` random patterns."""
     sides = range(2 * math.isqrt(rays), 0, -1)
     side = next(n for n in sides if pupil.square_grid(n)[1].size <= rays)
 
@@ -169,7 +172,8 @@ def spot_errors(truth: Moments, sigma: Array, mean: Array) -> tuple[float, float
 
 
 def row_of(arguments: tuple, truth: Moments, rules: Sequence[PupilRule]) -> dict:
-    """A row of `curves` for rules of a kind and size: median error, time of the first."""
+    """A row of `curves` for rules of one kind and size: median of their errors, time of the first
+    rule."""
     exact = np.mean(truth.gradient, axis=0)
     found = []
     for rule in rules:
@@ -185,13 +189,14 @@ def row_of(arguments: tuple, truth: Moments, rules: Sequence[PupilRule]) -> dict
 
 
 def count_rays(arguments: tuple, rule: PupilRule) -> int:
-    """Number of rays of the first wavelength with a weight."""
+    """Number of rays of the first wavelength whose weight is not 0."""
     weights = drt_jax.pupil.pupil_points(*arguments, rule)[1]
     return int(np.count_nonzero(np.asarray(weights)[0]))
 
 
 def prepare(scene: AccuracyScene, wavelengths: tuple[float, ...]) -> tuple[tuple, Moments]:
-    """Lens and scene, with the lens focused on axis and clipped, and the reference."""
+    """The lens, focused on axis and with the clear apertures of the scene; its scene; and the
+    reference."""
     lens = drt_jax.load_lens(scene.lens)
     distance, field = 1e3 * scene.distance_m, math.radians(scene.field_deg)
     spread = drt_jax.focus_moments(lens, Scene.point(0.0, distance, wavelengths), 1e-9).spread
@@ -214,7 +219,7 @@ def measure(config: Config, scene: AccuracyScene) -> dict[str, list[dict]]:
     """Measures one scene and returns its rows of results.json."""
     first = next(other for other in config.scenes if other.kind == scene.kind)
     if scene.vignetted or scene is first:
-        jax.clear_caches()  # thousands of kernels exhaust what a process may map
+        jax.clear_caches()  # thousands of kernels exceed the memory maps of a process
     arguments, truth = prepare(scene, config.wavelengths_um)
     kinds = [(_QUADRATURE, n, [scene.rule(n)]) for n in scene.orders or config.orders]
     for size in (n for n in config.rays if n <= scene.most_rays):
@@ -227,7 +232,7 @@ def measure(config: Config, scene: AccuracyScene) -> dict[str, list[dict]]:
         tolerances.append(row)
         try:
             rule = drt_jax.converge(drt_jax.psf_moments, *arguments, tolerance)
-        except ValueError as refusal:  # float32 does not allow it
+        except ValueError as refusal:  # a tolerance that float32 cannot reach
             if scene.dtype == "float64":
                 raise refusal
             continue
@@ -316,7 +321,7 @@ def draw_panel(axes: Any, rows: list[dict], x: str, y: str, labels: tuple[str, s
     curves, note = {}, None
     for (method,), some in grouped(rows, "method").items():
         groups = sorted(grouped(some, "size").items())
-        # Sizes of few scenes would bend the line of the median.
+        # Sizes that only few scenes have would distort the line of the median.
         most = max(len(group) for _, group in groups)
         groups = [(size, group) for (size,), group in groups if 2 * len(group) >= most]
         across = [middle(group, x) * (1e3 if x == "seconds" else 1) for _, group in groups]

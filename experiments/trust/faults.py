@@ -1,6 +1,6 @@
-"""Hostile input and sudden ends: files damaged at random, runs killed and stopped.
+"""Invalid input and interrupted runs: files damaged at random, runs killed and stopped.
 
-A damaged file must be refused in one line of at most 300 characters, or give a right result.
+A damaged file must raise an error of one line of at most 300 characters, or give a right result.
 Writes results.json: `rows` hold `kind`, `tried`, `refused`, `survived` (with a right result),
 `wrong` (a wrong result, or a message that is long or has several lines), `traceback`, `hang` (5 s
 for a file, minutes for a run), and `examples` of the last three.

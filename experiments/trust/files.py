@@ -1,13 +1,19 @@
-"""Lens files of other programs: right, near, refused, or silently wrong; and written again.
+"""Lens files of other programs: read right, near, wrong or refused; and written again.
 
 drt_jax and, where installed, Optiland and ray-optics read each `.zmx` and `.seq` file of some
-folders in the same run; NAME.txt beside it is OpticStudio's listing, or INDEX.md a table of focal
-lengths (column 4, mm, at the primary wavelength) that others confirm. Right: focal length,
-f-number, entrance pupil and all indices of glasses agree with the listing to its last digit, or the
-focal length to 1e-6; near: to a thousandth; wrong: not, and without a message. What drt_jax reads
-it writes in all formats, reads back and compares. Writes results.json: `rows` hold `file`,
-`reader`, `outcome`, `off` (the largest relative error of a number), `why` (the message, or the
-number of that error), and of drt_jax `trips`: by format "" or why there is none.
+folders in the same run. The numbers are compared with NAME.txt in the same folder, OpticStudio's
+listing, or with INDEX.md, a table of focal lengths (column 4, mm, at the primary wavelength) that
+other programs confirm.
+
+- right: focal length, f-number, entrance pupil and all indices of glasses agree with the listing to
+  its last digit, or the focal length with the table to 1e-6;
+- near: they agree to a thousandth;
+- wrong: they differ by more, and the program gives no message.
+
+drt_jax also writes each lens that it reads in all formats, reads it back and compares. Writes
+results.json: `rows` with `file`, `reader`, `outcome`, `off` (the largest relative error of a
+number), `why` (the message, or the name of the number with this error), and for drt_jax `trips`: by
+format "", or the reason why the file was not written or not read back as the same.
 """
 
 import contextlib
@@ -32,7 +38,7 @@ from .runs.folder import Run
 OUTCOMES = ("right", "near", "refused", "wrong", "unlisted", "absent")
 FORMATS = (".zmx", ".seq", ".yaml")
 _NEAR = 1e-3
-_INDEX = 2e-9  # silica's constants have one digit more in some programs
+_INDEX = 2e-9  # relative; the constants of silica have one more digit in some programs
 Read = tuple[list[float], list[float], float | None]
 _WIDE, _PLACE = "Entrance Pupil Diameter", "Entrance Pupil Position"
 _NUMBERS = "Effective Focal Length", "Image Space F/#", _WIDE, _PLACE
@@ -40,7 +46,8 @@ _NUMBERS = "Effective Focal Length", "Image Space F/#", _WIDE, _PLACE
 
 @dataclasses.dataclass(frozen=True)
 class Config:
-    """Settings of the experiment; see configs/files.yaml. folders: of files and listings."""
+    """Settings of the experiment; see configs/files.yaml. folders: folders with files and
+    listings."""
 
     folders: tuple[str, ...]
 
@@ -72,24 +79,25 @@ def _rayoptics(path: str) -> Read:
     own = model["analysis_results"]["parax_data"].fod
     primary = model["osp"]["wvls"].reference_wvl
     indices = [float(row[primary]) for row in model["seq_model"].rndx]
-    focal, wide = own.efl or np.inf, 2 * own.enp_radius  # 0 stands for none
+    focal, wide = own.efl or np.inf, 2 * own.enp_radius  # 0 means that there is none
     return [focal, focal / wide, wide, own.enp_dist], indices, None
 
 
 # [focal length, f-number, diameter and position of the entrance pupil], indices of all media, and
-# the distance from the object to the origin of that position; None for surface 1, as in listings.
+# the distance from the object to the origin of that position; None if the origin is surface 1, as
+# in listings.
 READERS: dict[str, Callable] = {"drt_jax": _ours, "optiland": _optiland, "rayoptics": _rayoptics}
 
 
 def listed(content: str, key: str) -> tuple[float, float] | None:
-    """A number of a listing and one unit of its last digit; None if it is not there."""
+    """A number of a listing, and one unit of its last digit; None if it is not listed."""
     found = re.search(rf"^{re.escape(key)}\s*:\s*([-+.\dEe]+)", content, re.MULTILINE)
     return found and (float(found[1]), 10.0 ** decimal.Decimal(found[1]).as_tuple().exponent)
 
 
 def listed_indices(content: str) -> list[float]:
-    """Indices of all listed glasses at the primary wavelength, without that behind the image; empty
-    if there are none."""
+    """Indices of all listed glasses at the primary wavelength, except the medium behind the image;
+    empty if there are none."""
     table = content.partition("INDEX OF REFRACTION")[2]
     head = re.search(r"^Surf .*?((?:\s+\d\.\d{8})+)", table, re.MULTILINE)
     primary = re.search(r"^Primary Wavelength.*:\s*([\d.]+)", content, re.MULTILINE)
@@ -104,8 +112,9 @@ def listed_indices(content: str) -> list[float]:
 def differences(
     content: str, first: list[float], indices: list[float], far: float | None
 ) -> list[tuple]:
-    """(relative error, whether it is right, text) of each number of a listing. Signs are not
-    compared, because programs differ behind mirrors; listings write 1e10 for no focal length."""
+    """(relative error, whether it is right, text) for each number of a listing. Signs are not
+    compared, because those behind mirrors differ between programs. A listing has 1e10 for a lens
+    without a focal length."""
     found = []
     wide = (listed(content, _WIDE) or (1.0,))[0]
     finite = re.search(r"^ OBJ\s+\S+\s+\S+\s+([-+.\dEe]+)\s", content, re.MULTILINE)
@@ -134,7 +143,8 @@ def differences(
 
 
 def indexed(path: pathlib.Path) -> float | None:
-    """The focal length (mm) of a file in the table of INDEX.md beside it; None if it is not."""
+    """The focal length (mm) of a file in the table INDEX.md of its folder; None if the table does
+    not have it."""
     index = path.with_name("INDEX.md")
     lines = index.read_text().splitlines() if index.is_file() else []
     cells = [[cell.strip() for cell in line.split("|")] for line in lines]
@@ -142,7 +152,7 @@ def indexed(path: pathlib.Path) -> float | None:
 
 
 def trips(path: pathlib.Path) -> dict[str, str]:
-    """By format, why a file is not written again and read back as the same; "" where it is."""
+    """By format, the reason why a file is not written or not read back as the same; "" if it is."""
     found: dict[str, str] = {}
     with tempfile.TemporaryDirectory() as folder, warnings.catch_warnings():
         warnings.simplefilter("ignore")
@@ -160,7 +170,7 @@ def trips(path: pathlib.Path) -> dict[str, str]:
 
 
 def outcome(path: pathlib.Path, reader: str) -> dict[str, Any]:
-    """Row of one file read by one program, whose output is dropped."""
+    """Row of one file read by one program. The output of the program is discarded."""
     row = {"file": path.name, "reader": reader, "off": None}
     try:
         with warnings.catch_warnings(), contextlib.redirect_stdout(io.StringIO()):
@@ -214,8 +224,8 @@ def counts(rows: list[dict[str, Any]], reader: str) -> list[int]:
 
 
 def tables(results: dict[str, Any]) -> dict[str, str]:
-    """Tables of outcomes by file and program, and of their numbers. `why` is our message, else the
-    error of another program."""
+    """Tables of outcomes by file and program, and of their counts. `why` is our message, or else
+    the error of another program."""
     rows = []
     for (name,), group in _common.grouped(results["rows"], "file").items():
         errors = [f"{row['reader']}: {row['why']}" for row in group if row["outcome"] == "wrong"]

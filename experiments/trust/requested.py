@@ -1,10 +1,10 @@
-"""The tolerance that is asked for beside the error that comes, of every quantity that takes one.
+"""Requested tolerance and actual error of every quantity that has a tolerance.
 
-Each lens is at some fields, in float64 and float32. The truth is the same function in float64 with
-far finer sampling (`Quantity.finest`); `accuracy` compares spots with another tracer. Writes
-results.json, whose `rows` hold `quantity`, `lens`, `field_deg`, `dtype`, `tolerance` and `error`,
-or in `refused` why there is none: a tolerance that float32 cannot keep, or a scene that has no
-answer. Draws error over tolerance, with the diagonal.
+Each lens is evaluated at some fields, in float64 and float32. The reference is the same function in
+float64 with much finer sampling (`Quantity.finest`); `accuracy` compares spots with another tracer.
+Writes results.json, whose `rows` have `quantity`, `lens`, `field_deg`, `dtype`, `tolerance` and
+`error`, or in `refused` the reason why there is no value: float32 cannot reach the tolerance, or
+the quantity is undefined for the scene. Draws error over tolerance, with the diagonal.
 """
 
 import dataclasses
@@ -44,12 +44,12 @@ class Setting(NamedTuple):
 
 
 class Quantity(NamedTuple):
-    """What takes a tolerance.
+    """A quantity that has a tolerance.
 
     value: function of a `Setting` and a tolerance.
-    error: function of a value and the truth, in the words of the tolerance.
-    tolerances: asked for.
-    finest: tolerance of the truth.
+    error: function of a value and the reference; the error as the tolerance defines it.
+    tolerances: the requested tolerances.
+    finest: tolerance of the reference.
     """
 
     value: Callable[[Setting, float], Any]
@@ -143,8 +143,8 @@ class Config:
     """Settings of the experiment; see configs/requested.yaml.
 
     views: lenses.
-    parts: fields as parts of the largest.
-    quantities: of `QUANTITIES`.
+    parts: fields relative to the largest.
+    quantities: names from `QUANTITIES`.
     """
 
     views: Annotated[tuple[View, ...], not_empty]
@@ -156,7 +156,7 @@ class Config:
 
 def measure(config: Config, view: View) -> list[dict[str, Any]]:
     """The rows of a lens."""
-    jax.clear_caches()  # thousands of kernels exhaust what a process may map
+    jax.clear_caches()  # thousands of kernels exceed the memory maps of a process
     lens, rows = drt_jax.load_lens(view.lens), []
     for part in config.parts:
         field = math.radians(part * view.field_deg)
@@ -178,10 +178,10 @@ def measure(config: Config, view: View) -> list[dict[str, Any]]:
 
 
 def answered(quantity: Quantity, at: Setting, tolerance: float) -> tuple[np.ndarray | None, str]:
-    """The value in float64 or complex128, and "" or why there is none."""
+    """The value in float64 or complex128, and ""; or None and the reason why there is no value."""
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # a tolerance that is not met is seen in the error
+            warnings.simplefilter("ignore")  # the error shows a tolerance that is not reached
             found = np.asarray(quantity.value(at, tolerance))
     except ValueError as refusal:
         return None, str(refusal)
@@ -195,7 +195,7 @@ def run(config: Config, run: Run) -> dict[str, Any]:
 
 
 def tables(results: dict[str, Any]) -> dict[str, str]:
-    """How often a tolerance is kept, by quantity and dtype, and the worst error beside it."""
+    """Table of how often each tolerance is kept, by quantity and dtype, with the worst error."""
     lines = []
     for (quantity, dtype), rows in _common.grouped(results["rows"], "quantity", "dtype").items():
         ratios = [row["error"] / row["tolerance"] for row in rows if row["error"] is not None]

@@ -1,7 +1,7 @@
-"""Classical sequential ray trace by Snell's law: the oracle and the baseline.
+"""Sequential ray trace by Snell's law: the reference for accuracy and the baseline for speed.
 
-From the textbook (Welford, Aberrations of Optical Systems, ch. 4); it shares no formula with the
-Fermat solver except the sag. One ray at a time; `jax.vmap` for more.
+It follows the textbook (Welford, Aberrations of Optical Systems, ch. 4), and shares no formula with
+the Fermat solver except the sag. It traces one ray; use `jax.vmap` for more.
 """
 
 from functools import partial
@@ -17,16 +17,16 @@ from drt_jax.lens.elements import rotation_matrix
 from drt_jax.lens.forms import Shape
 from drt_jax.lens.surface import domain, sag_derivatives
 
-# Of XLA, for programs that trace many rays a few times.
+# Options of XLA for programs that trace many rays a few times.
 QUICK = {**LARGE, "xla_backend_optimization_level": 1, "xla_llvm_disable_expensive_passes": True}
-_NEWTON_STEPS = 40  # a nearly grazing ray only halves its distance in each
+_NEWTON_STEPS = 40  # for a nearly grazing ray, each step only halves the distance
 
 
 def _to_conic(q: Array, d: Array, shape: Shape, side: Array, start: Array) -> Array:
     """Length s at which q + s d meets a conic with its vertex at the origin; NaN if it does not.
 
-    A line crosses a quadric twice at most. Of the crossings on the sheet of the vertex that lie not
-    before `start`, the first in the direction of `side` is taken, or else the other.
+    A line crosses a quadric at most twice. Crossings on the sheet of the vertex with s >= `start`
+    count. The first one in the direction of `side` is taken; if there is none, the other one.
 
     side: 1 to cross the surface towards +z, -1 towards -z.
     """
@@ -123,8 +123,8 @@ def virtual(lens: Lens) -> Array:
 
 
 def _bend(d: Array, normal: Array, row: _Row, side: Array) -> tuple[Array, Array]:
-    """Direction behind a surface, and whether it exists and light crosses it towards `side` (1, -1;
-    0 for either)."""
+    """Direction behind a surface; and whether it exists and light crosses the surface towards
+    `side` (1, -1; 0 for either)."""
     cosine = normal @ d
     square = 1 - row.ratio**2 * (1 - cosine**2)
     along = jnp.sign(cosine) * jnp.sqrt(jnp.maximum(square, 0)) - row.ratio * cosine
@@ -136,17 +136,21 @@ def _bend(d: Array, normal: Array, row: _Row, side: Array) -> tuple[Array, Array
 def trace_snell(
     lens: Lens, wavelength: Array, point: Array, direction: Array, begun: Array | float = jnp.inf
 ) -> tuple[Array, Array]:
-    """Traces one ray through a lens to its sensor. Returns the hits (S + 1, 3) along the axes of
-    the lens, z from the first vertex, mm, and True if the ray meets every surface, goes forwards
-    from the object to the first active surface and between active ones, and is not totally
-    reflected. Without tilts light crosses surfaces the way that the number of mirrors says; with
-    tilts, either. Surfaces that are not active are crossed by the straight line, forwards or
-    backwards; a sensor in front of the last surface, by the line prolonged backwards.
+    """Traces one ray through a lens to its sensor.
+
+    Without tilts, the number of mirrors determines the direction in which light crosses a surface;
+    with tilts, both directions are accepted. The straight line, forwards or backwards, crosses
+    surfaces that are not active. A sensor in front of the last surface is crossed by the line
+    extended backwards.
 
     wavelength: (), um.
     point: (3,), anywhere on the ray in front of the lens, mm.
     direction: (3,), unit vector.
-    begun: (), mm along the ray from the object to `point`, inf for an object at infinity.
+    begun: (), distance along the ray from the object to `point`, mm; inf for an object at infinity.
+
+    Returns the hits (S + 1, 3) along the axes of the lens, z from the first vertex, mm; and True if
+    the ray meets every surface, goes forwards from the object to the first active surface and
+    between active ones, and is not totally reflected.
     """
     forms = sorted(set(lens.forms))
     branches = [partial(_intersect, form=form) for form in forms]

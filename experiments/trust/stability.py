@@ -1,8 +1,7 @@
-"""Thousands of random scenes made to break the tracer: can its rays, derivatives and statuses be
-trusted?
+"""Reliability of rays, derivatives and statuses in thousands of difficult random scenes.
 
-Compares every good ray with a sequential trace by Snell's law. For every failed ray, that trace
-searches for a ray through the same stop point. Draws steps and errors by family.
+Every good ray is compared with a sequential trace by Snell's law. For every failed ray, this trace
+is used to search for a ray through the same stop point. Draws steps and errors by family.
 """
 
 import dataclasses
@@ -22,12 +21,12 @@ from ._families import FAMILIES
 from ._survey import survey
 from .runs.folder import Run
 
-# Counts of the survey; and those of each family that are summed over all.
+# Counts of the survey; and counts of each family that are summed over all families.
 _FAULTS = ("traceable", "nan_values", "nan_gradients", "disagree_with_snell")
 _COUNTS = ("scenes", "rays", *(status.name.lower() for status in Status), *_FAULTS)
 # Confidence of the bounds.
 _SURE = 0.95
-# Most structures: programs of more exhaust the maps of a process.
+# Largest number of structures whose programs are kept: more exceed the memory maps of a process.
 _STRUCTURES = 6
 
 
@@ -35,7 +34,7 @@ _STRUCTURES = 6
 class Config:
     """Settings of the experiment; see configs/stability.yaml.
 
-    scenes: number of scenes of a family of full size; some have half.
+    scenes: number of scenes of a family of full size; some families have half as many.
     families: names of the families to run; empty for all.
     """
 
@@ -45,9 +44,9 @@ class Config:
 
 
 def bound(count: int, of: int) -> float:
-    """Share of a population that lies below with a confidence of 95 % if `count` of `of` draws
-    show something: the exact binomial bound (Clopper and Pearson 1934). It is 3 / of for a count of
-    0 (the rule of three)."""
+    """Upper bound, with a confidence of 95 %, of the share of a population with some property, if
+    `count` of `of` draws have it: the exact binomial bound (Clopper and Pearson 1934). It is about
+    3 / of for a count of 0 (the rule of three)."""
     return float(stats.beta.ppf(_SURE, count + 1, of - count)) if count < of else 1.0
 
 
@@ -82,7 +81,7 @@ def row_of(name: str, found: dict[str, np.ndarray]) -> dict[str, Any]:
 
 
 def totals(rows: list[dict]) -> dict[str, float]:
-    """Sums over all families, and rates of lost rays."""
+    """Sums of the counts over all families, and rates of lost rays."""
     sums: dict[str, float] = {key: sum(row[key] for row in rows) for key in _COUNTS}
     others = [row for row in rows if row["name"] != "touching"]
     for name, some in ("", rows), ("_but_touching", others):
@@ -130,7 +129,7 @@ def _bounded(count: int, row: dict[str, Any], of: str = "rays") -> tuple[int, st
 
 
 def tables(results: dict[str, Any]) -> dict[str, str]:
-    """Tables of all families together, and of each. Bounds are those of `bound`."""
+    """A table of all families together, and one with a row for each; with bounds by `bound`."""
     header = ["family", "rays", "good", "lost", "in 10,000 rays, at most", "wrong"]
     header += ["in 10,000 rays, at most", "largest error of a good ray"]
     header += ["Newton steps, median and most", "float32 within, 99 %"]

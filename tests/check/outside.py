@@ -1,5 +1,5 @@
-"""The truths of `drt-jax check` that no other program prints, computed without the package: closed
-forms, the trace of `tests.oracle`, and SciPy."""
+"""The reference values of `drt-jax check` that no other program prints, computed without the
+package: closed forms, the trace of `tests.oracle`, and SciPy."""
 
 import numpy as np
 from scipy.integrate import dblquad
@@ -16,7 +16,8 @@ PIXEL = 0.0044
 
 
 def gradient():
-    """By a complex step through the oracle's sequential trace, 16 x 16 Gauss nodes."""
+    """The gradient by a complex step through the oracle's sequential trace, with 16 x 16 Gauss
+    nodes."""
     lens = scenes.zemax_double_gauss()
     scene = oracle.Scene.of(lens, np.radians(14), np.inf, [0.5876])
     points, weights = map(np.asarray, gauss_points(16, "bilateral"))
@@ -30,7 +31,8 @@ def gradient():
 
 
 def kernel():
-    """Airy's pattern over the area of each pixel; even light in direction cosines."""
+    """Airy's pattern integrated over the area of each pixel, for light that is even in direction
+    cosines."""
     wave, aperture = 2 * np.pi / 0.5e-3, 1 / np.hypot(1, 100 - 1 / 400)
 
     def light(y, x):
@@ -43,8 +45,8 @@ def kernel():
 
 
 def clipped():
-    """Two discs of the radius 1, their centres 0.7 apart: the lens between two arcs. The beam
-    is parallel, so that the sensor shows the stop."""
+    """The overlap of two discs of the radius 1 with centres 0.7 apart. The beam is parallel, so
+    that the spot on the sensor has the shape of the stop."""
     half = 0.35
     angle = np.arccos(half)
     area = 2 * (angle - half * np.sin(angle))
@@ -57,7 +59,8 @@ def clipped():
 
 
 def gaussian(offset, variance, size=9):
-    """The shares of a Gaussian in a row of pixels, with the sum 1; also for a complex step."""
+    """The integrals of a Gaussian over the pixels of a row, normalised to the sum 1; also for a
+    complex step."""
     edges = (np.arange(size + 1) - size / 2) * PIXEL
     t = (edges - offset) / np.sqrt(2 * variance)
     below = erf(t.real) + 2 / np.sqrt(np.pi) * np.exp(-(t.real**2)) * 1j * t.imag
@@ -70,7 +73,7 @@ def blurred(plane, row, column):
 
 
 def sensor():
-    """SciPy's convolution with shares of error functions, three times: for three ways."""
+    """SciPy's convolution with Gaussian integrals, three times, for three ways of the package."""
     offset = ([0.0, 0.0], [0.002, 0.0], [0.0, -0.003])
     spread = ([3e-5, 2e-5], [2e-5, 5e-5], [1e-5, 1e-5])
     picture = scenes.chart(14, 20)[1]
@@ -81,7 +84,7 @@ def sensor():
 
 
 def convolved(images, layer):
-    """A layer of 3 x 3 weights on pictures (B, H, W, in), zeros beyond the edges."""
+    """A layer of 3 x 3 weights on pictures (B, H, W, in), with zeros beyond the edges."""
     height, width = images.shape[1:3]
     padded = np.pad(images, ((0, 0), (1, 1), (1, 1), (0, 0)))
     shifted = (padded[:, i : i + height, j : j + width] for i in range(3) for j in range(3))
@@ -90,8 +93,9 @@ def convolved(images, layer):
 
 
 def loss(place, layers):
-    """Mean absolute error of the restored pictures, grey levels of 255. A ray of the height h
-    meets the sensor at step h / (f - h^2 / (4 f)), h^2 is even from 0 to 4 mm^2."""
+    """Mean absolute error of the restored pictures, in grey levels of 255. A ray of the height h
+    meets the sensor at step h / (f - h^2 / (4 f)); h^2 is uniformly distributed from 0 to 4
+    mm^2."""
     picture, focal, step = np.round(255 * scenes.chart(24, 24)) / 255, 50.0, place + 50
     nodes, weights = np.polynomial.legendre.leggauss(20)
     square = 2 * (nodes + 1)
@@ -108,8 +112,8 @@ def loss(place, layers):
 
 
 def training():
-    """Three steps of Adam (Kingma and Ba 2015) on gradients by a complex step for each weight.
-    The network's weights are rounded to float32, as those of the package are."""
+    """Three steps of Adam (Kingma and Ba 2015) with gradients by a complex step for each weight.
+    The network's weights are rounded to float32, as in the package."""
     names = [(i, k) for i in range(2) for k in ("kernel", "bias")]
     layers = scenes.network()
     values = [layers[i][k].astype(np.float32).astype(complex) for i, k in names]

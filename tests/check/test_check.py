@@ -1,4 +1,4 @@
-"""`drt-jax check`: its truths are what they say, and it fails when a number is wrong."""
+"""`drt-jax check`: its reference values are right, and it fails if a number is wrong."""
 
 import dataclasses
 import json
@@ -17,7 +17,7 @@ PRINTED = {"glass", "rays", "single", "spots", "mtf", "designed"}
 
 
 def checked(*words):
-    """The exit status of the command."""
+    """Runs the command; returns its exit status."""
     try:
         main(["check", *map(str, words)])
     except SystemExit as ended:
@@ -27,7 +27,7 @@ def checked(*words):
 
 @pytest.mark.slow
 def test_two_scenes_are_right(tmp_path, capsys):
-    """Table, versions, file and exit status."""
+    """Checks table, versions, file and exit status."""
     file = tmp_path / "check.json"
     assert checked("glass", "sensor", "--json", file) == 0
     said = capsys.readouterr().out
@@ -46,7 +46,7 @@ def test_two_scenes_are_right(tmp_path, capsys):
 
 
 def test_an_index_that_is_wrong_by_a_millionth_is_named(monkeypatch, capsys):
-    """And a scene that cannot be computed, or has other numbers, stops no other."""
+    """A scene that cannot be computed, or has other numbers, does not stop the others."""
 
     def disturbed(source):
         lens = load_lens(source)
@@ -80,7 +80,7 @@ def test_an_unknown_scene_is_one_line(capsys):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", sorted(TRUTHS.keys() - PRINTED))
 def test_truths_that_no_program_prints_come_from_outside(name):
-    """To the digits that are stored."""
+    """They agree to the digits that are stored."""
     assert len(TRUTHS[name].values) == len(getattr(outside, name)())
     np.testing.assert_allclose(TRUTHS[name].values, getattr(outside, name)(), rtol=1e-11)
 

@@ -1,4 +1,5 @@
-"""Several configurations as one problem: against single problems, closed forms and differences."""
+"""Several configurations as one problem, compared with single problems, closed forms and finite
+differences."""
 
 import functools
 
@@ -13,7 +14,7 @@ from drt_jax.design.optimum import take_step
 from drt_jax.rays.solve import solve_aimed
 
 GAP, SENSOR = "thickness 3", "sensor"
-# Two thin lenses of the powers 1 / 100 and 1 / 60 in air, each curved on its first side.
+# Two thin lenses with the powers 1 / 100 and 1 / 60 in air, each with a curved first surface.
 PAIR = """
 surfaces:
   - {radius: 50.0, thickness: 1.0e-6, nd: 1.5, vd: 60.0, semi_diameter: 0.005, stop: true}
@@ -28,7 +29,8 @@ def scene(distance, fields=(0, 14)):
 
 
 def triplet(lens, distance=np.inf, weight=1.0, fields=(0, 14)):
-    """A problem of the triplet: curvatures, two tied, a gap and the sensor, which is solved."""
+    """A problem of the triplet with variables curvatures, two of them tied, and a gap; the sensor
+    is solved."""
     variables = Variables.from_lens(
         lens,
         ["curvature", Vary("thickness", (3,), low=1.0, high=9.0)],
@@ -53,7 +55,7 @@ def both():
 
 @functools.cache
 def evaluated():
-    """Values and Jacobians of both at their start and beside it: y, values, derivatives."""
+    """Vectors at the start and near it, with values and derivatives of both problems."""
     start = both().variables.start
     moves = np.random.default_rng(0).normal(size=start.size)
     y = start + 0.05 * jnp.asarray(moves)
@@ -88,7 +90,7 @@ def test_two_configurations_are_two_problems():
         constraints.append(one.constraints)
     np.testing.assert_allclose(found.residuals, np.concatenate(residuals), rtol=0, atol=1e-13)
     np.testing.assert_allclose(found.constraints, np.concatenate(constraints), rtol=0, atol=1e-13)
-    # The numbers that differ alone have an axis of configurations.
+    # Only the numbers that differ have an axis of configurations.
     (group,) = both().groups
     assert group.numbers == (0, 1) and len(group.differ) < 6
 
@@ -118,7 +120,7 @@ def test_lenses_share_all_but_their_own():
 
 
 def test_a_group_moves_between_two_that_stand():
-    """A tie with a gap that each configuration has of its own."""
+    """A tie with a gap that has a value for each configuration."""
     made = []
     for lens in configured(load_lens("cooke_triplet"), {"thickness 1": (6.0, 5.0)}):
         tie = Tie((1, 3), "opposite", "thickness", shift=10.5)
@@ -144,7 +146,8 @@ def test_limits_name_their_configuration():
 
 
 def pair(tmp_path, focal_lengths):
-    """Two groups, a configuration for each focal length; each moves both, to stay in focus."""
+    """Two groups, with a configuration for each focal length; both groups move, to keep the
+    focus."""
     path = tmp_path / "pair.yaml"
     path.write_text(PAIR)
     count = len(focal_lengths)
@@ -161,7 +164,8 @@ def pair(tmp_path, focal_lengths):
 
 
 def test_a_zoom_of_two_groups_is_that_of_the_closed_form(tmp_path):
-    """d = f1 + f2 - f1 f2 / f and the focus f (1 - d / f1) behind the second group."""
+    """The distance is d = f1 + f2 - f1 f2 / f, and the focus f (1 - d / f1) behind the second
+    group."""
     wanted = np.array([40.0, 50.0, 60.0])
     zoom = Configurations.from_problems(pair(tmp_path, wanted), ["thickness 1"])
     found = design.optimise(zoom)
@@ -178,7 +182,8 @@ def test_a_zoom_of_two_groups_is_that_of_the_closed_form(tmp_path):
 
 @pytest.mark.slow
 def test_a_lens_that_focuses_is_designed():
-    """At infinity and at 400 mm: it is better than the start, and as good as two lenses nowhere."""
+    """At infinity and at 400 mm the designed lens is better than the start, and in no configuration
+    as good as a lens for this configuration alone."""
     joined = Configurations.from_problems(problems(), [GAP])
     start = joined.merits(joined.variables.start)
     found = design.optimise(joined)
@@ -193,7 +198,7 @@ def test_a_lens_that_focuses_is_designed():
 
 @pytest.mark.slow
 def test_problems_of_other_structures_stand_side_by_side():
-    """Three fields in one configuration, two in the other."""
+    """One configuration has three fields, the other two."""
     one, two = problems()
     more = triplet(two.variables.lens, 400.0, 2.0, (0, 10, 14))
     joined = Configurations.from_problems([more, one, two], [GAP])
@@ -274,8 +279,8 @@ def test_configured_folds_a_mirror_and_keeps_the_rest():
 
 @pytest.mark.slow
 def test_an_athermal_pair_is_that_of_the_closed_form():
-    """Thin lenses of N-FK51A and N-BK7 in contact, 100 mm in front of the sensor in a tube of
-    aluminium, in focus at -20 and at 60 C: the powers at 20 C solve two linear equations."""
+    """Thin lenses of N-FK51A and N-BK7 in contact, 100 mm in front of the sensor in an aluminium
+    tube, are in focus at -20 and at 60 C. The powers at 20 C solve two linear equations."""
     surface = {"thickness": 1e-6, "semi_diameter": 0.005}
     rows = [
         surface | {"radius": 60.0, "glass": "N-FK51A", "stop": True},
@@ -299,8 +304,8 @@ def test_an_athermal_pair_is_that_of_the_closed_form():
     wanted = np.linalg.solve(powers, 1 / (100 * (1 + 23.6e-6 * np.array([-40.0, 40.0]))))
     curvature = np.asarray(cold.lens_of(found.vector).curvature)[[0, 2]]
     np.testing.assert_allclose(curvature * (index[0] - 1), wanted, rtol=1e-4)
-    # the lens of each configuration is that at its temperature; it is in focus, the lens of
-    # one glass is not
+    # the lens of each configuration is that at its temperature; it is in focus, but the lens
+    # with one glass is not
     hot = joined.lenses(found.vector)[1]
     assert hot.glasses[1] == "N-FK51A at 60 C"
     focus = [float(first_order(own, np.inf, 0.55).back_focal_distance[0]) for own in lenses]

@@ -1,5 +1,5 @@
-"""Derivatives of operands by all kinds of variables, and of the merit of rays that fail: against
-central differences whose step is varied, in forward and reverse mode."""
+"""Derivatives of operands by all kinds of variables, and of the merit of failing rays, compared
+with central differences of varied steps, in forward and reverse mode."""
 
 from functools import partial
 
@@ -22,12 +22,12 @@ EVERY = [
     *(Vary("tilt", (2,)), Vary("decentre", (5,)), Vary("semi_diameter", (0, 4))),
 ]
 STEPS = (1e-1, 1e-2, 1e-3, 1e-4, 1e-5)
-# Of what is evaluated a hundred times: machine code as good as this takes no longer to make.
+# For functions that are evaluated a hundred times: this optimisation takes no longer to compile.
 OFTEN = {**LARGE, "xla_backend_optimization_level": 1}
 
 
 def differences(value, x, steps):
-    """Central differences of the leaves of a tree, for each step: (K, N) each."""
+    """Central differences of the leaves of a tree, (K, N) each, for each step."""
     for h in steps:
         pairs = [jax.device_get((value(x + h * e), value(x - h * e))) for e in np.eye(len(x))]
         slopes = [jax.tree.map(lambda a, b, h=h: (a - b) / (2 * h), *pair) for pair in pairs]
@@ -35,8 +35,9 @@ def differences(value, x, steps):
 
 
 def assert_derivatives(value, jacobian, x, rtol, floor=1e-2, steps=STEPS):
-    """Each kind by each number, against the best of the differences: within `rtol` of the largest
-    derivative by that number, plus a part `floor` of it by any."""
+    """Compares the derivative of each kind by each number with the best of the differences: within
+    `rtol` of the largest derivative by that number, plus `floor` times the largest derivative by
+    any number."""
     best = jax.tree.map(lambda a: np.full(a.shape, np.inf), jacobian)
     for found in differences(value, x, steps):
         best = jax.tree.map(
@@ -51,16 +52,16 @@ def assert_derivatives(value, jacobian, x, rtol, floor=1e-2, steps=STEPS):
 
 @pytest.fixture(scope="module")
 def crooked(tmp_path_factory):
-    """A lens without symmetry, clipped in front, that some rays of the last field do not pass."""
+    """A lens without symmetry, with an aperture in front that clips some rays of the last field."""
     variables = Variables.from_lens(model(tmp_path_factory.mktemp("lens")), EVERY)
-    # Of `throughput` rays drop out one by one; of waves see test_waves.
+    # In `throughput`, rays drop out one by one; for waves see test_waves.
     kinds = [k for k, value in OPERANDS.items() if k != "throughput" and not value.of_waves]
     fields = [[0.02, 0.05], [0.01, 0.25], [0.03, 0.45]]
     problem = Problem.from_variables(
         variables, kinds, Scene.radians(fields, 800.0, COLOURS), Gauss(3, "none")
     )
     moves = np.random.default_rng(0).normal(size=len(variables.places))
-    # As optimisers search: a third of the program, and the derivatives do not know.
+    # Aiming alone, as in optimisers: a third of the program, with the same derivatives.
     return problem.with_solver(solve_aimed), variables.start + moves
 
 
@@ -80,7 +81,8 @@ def test_every_derivative_by_every_kind_of_variable(crooked):
 
     @partial(jit, wanted=LARGE)
     def both_modes(x):
-        """All columns of the Jacobian; of the transpose one product tells."""
+        """All columns of the Jacobian in forward mode; for reverse mode one product with the
+        transpose is compared."""
         _, forward, status = jax.linearize(flat, x, has_aux=True)
         jacobian = jax.vmap(forward, out_axes=-1)(jnp.eye(len(x)))
         return jacobian, jax.linear_transpose(forward, x)(weights)[0], status
@@ -96,7 +98,7 @@ def test_every_derivative_by_every_kind_of_variable(crooked):
 
 @pytest.mark.slow
 def test_derivatives_of_a_fitted_pupil():
-    """Where apertures cut, the points of the rule follow the lens."""
+    """Where apertures clip the beam, the points of the rule change with the lens."""
     lens = load_lens("camera_50mm")
     vary = [Vary("curvature", (0,)), Vary("index", (2,)), Vary("semi_diameter", (2, 8))]
     kinds = ("rms_spot", "rms_wavefront", "centroid", "relative_illumination", "throughput")
@@ -114,13 +116,13 @@ def test_derivatives_of_a_fitted_pupil():
     x = problem.variables.start
     value = jit(values, OFTEN)
     jacobian = jit(jax.jacfwd(values), LARGE)(x)
-    # The derivatives are those of the light; the rule's own error moves by less than this.
+    # The derivatives are those of the exact integral; the error of the rule changes less.
     assert_derivatives(value, jacobian, x, 1e-4, floor=1.0)
 
 
 @pytest.fixture(scope="module")
 def strong(tmp_path_factory):
-    """A problem and a vector of which the last surface is too strong for the outer rays."""
+    """A problem, and a vector for which the last surface is too strong for the outer rays."""
     lens = model(tmp_path_factory.mktemp("lens"))
     variables = Variables.from_lens(lens, [Vary("curvature", (0, 3, 5, 6)), "sensor"])
     problem = Problem.from_variables(
@@ -131,7 +133,7 @@ def strong(tmp_path_factory):
 
 @pytest.mark.slow
 def test_rays_that_fail_have_a_smooth_merit(strong):
-    """Finite; its gradient, forward and reverse, agrees with differences."""
+    """The merit is finite; its gradient in forward and reverse mode agrees with differences."""
     problem, x = strong
     whole = jax.jit(lambda x: trace_fields(problem, problem.variables.lens_of(x)).arrives)(x)
     assert 0.02 < 1 - np.mean(whole) < 0.5
@@ -145,7 +147,7 @@ def test_rays_that_fail_have_a_smooth_merit(strong):
         slopes = [(both(x + h * e)[0] - both(x - h * e)[0]) / (2 * h) for e in np.eye(len(x))]
         best = np.minimum(best, np.abs(np.stack(slopes) - gradient))
     assert np.max(best) < 1e-7 * np.max(np.abs(gradient))
-    # It pulls the surface back: weaker, it lets more light through.
+    # The gradient makes the surface weaker, so that it passes more light.
     assert gradient[3] * x[3] > 0
 
 
@@ -159,8 +161,8 @@ def test_a_few_steps_bring_all_rays_through(strong):
 
 @pytest.mark.slow
 def test_random_lenses_are_never_nan(strong):
-    """However many rays fail, merit and gradients are numbers: as optimisers try them, and of a few
-    as they are searched in full."""
+    """Merit and gradients are finite however many rays fail, with aiming alone as in optimisers,
+    and for a few lenses with the full search."""
     problem, x = strong
     both, full = (
         jit(jax.vmap(jax.value_and_grad(p.merit)), LARGE)

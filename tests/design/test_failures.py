@@ -1,4 +1,5 @@
-"""By how much rays fail: nothing for those that pass, else finite, growing, and differentiable."""
+"""The shortfall of rays: 0 for rays that pass; for failing rays finite, increasing, and
+differentiable."""
 
 import dataclasses
 
@@ -19,7 +20,7 @@ WAVES = (0.48, 0.6)
 
 
 def told(lens, field=0.2):
-    """Status at the end and shortfall, (W, Q) each; the guess is the paraxial one."""
+    """Status at the end and shortfall, (W, Q) each, for the paraxial guess."""
     system = system_of(lens, checked_scene(lens, Scene.point(field, jnp.inf, WAVES)))
     radius = lens.semi_diameter[lens.stop]
     target = tuple(jnp.broadcast_to(radius * p, (2, p.size)) for p in POINTS)
@@ -57,7 +58,8 @@ def test_the_stronger_a_surface_the_more_is_lacking(name, surface):
 @pytest.mark.slow
 @pytest.mark.parametrize("name, surface", [("cooke_triplet", 5), ("phone", 5)])
 def test_derivatives_are_those_of_differences(name, surface):
-    """By all curvatures and thicknesses; forward and reverse mode, the axis ray too."""
+    """Derivatives by all curvatures and thicknesses, in forward and reverse mode, also for the
+    axial ray."""
     lens = bent(load_lens(name), surface, 4.0)
     count = lens.curvature.size
 

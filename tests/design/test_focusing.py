@@ -1,4 +1,4 @@
-"""Breathing and magnification over focus: against the thin lens."""
+"""Breathing and magnification over focus, compared with a thin lens."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -18,7 +18,8 @@ THIN = {
 
 
 def test_a_thin_lens_breathes_by_the_closed_form():
-    """In focus at m it stands f (1 - m) before the sensor: tan(angle) = height / (f (1 - m))."""
+    """A lens that is in focus at the magnification m is f (1 - m) in front of the sensor:
+    tan(angle) = height / (f (1 - m))."""
     m = np.array([0.0, -0.1, -0.5])
     lenses = configured(load_lens(THIN), {"sensor": 100 * (1 - m)})
     distances = [np.inf, *(100 * (1 - 1 / m[1:]))]
@@ -30,11 +31,12 @@ def test_a_thin_lens_breathes_by_the_closed_form():
 
 
 def test_the_angle_is_that_from_the_entrance_pupil():
-    """The object point of a real lens that images -m h to h: m h over its distance to the pupil."""
+    """For the object point of a real lens that is imaged from -m h to h, the tangent is m h divided
+    by the distance to the entrance pupil."""
     lens, distance, height = load_lens("cooke_triplet"), 300.0, 1e-3
     found = focusing([lens, lens], [distance, 1e8], height, 0.55)
     first = first_order(lens, distance, jnp.array([0.55]))
-    # In the plane of the sensor, where this object is out of focus, the chief ray comes to h.
+    # This object is out of focus in the plane of the sensor, where the chief ray has the height h.
     exit_to_sensor = lens.sensor - jnp.sum(lens.thickness) - first.exit_pupil.position[0]
     focus = first.image_distance[0] - jnp.sum(lens.thickness) - first.exit_pupil.position[0]
     sharp = height * focus / exit_to_sensor

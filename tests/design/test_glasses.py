@@ -1,4 +1,4 @@
-"""Model glasses that become real ones, against thin lenses in closed form."""
+"""Real glasses in place of model glasses, compared with thin lenses in closed form."""
 
 import dataclasses
 import functools
@@ -27,10 +27,9 @@ DOUBLET["surfaces"][0]["stop"] = True
 
 
 def thin(crown, flint):
-    """Of a thin doublet of the power 1 at d that has the smallest spots: its mean square radius of
-    the spot for rays of the mean square height 1, and the power of the crown. The power at a
-    wavelength is p u + (1 - p) w; the focus is free, so that the variance over wavelengths counts.
-    """
+    """The thin doublet of the power 1 at d with the smallest spots: mean square radius of the spot
+    for rays of the mean square height 1, and power of the crown. The power at a wavelength is p u +
+    (1 - p) w. The focus is free, so that the spot depends on the variance over the wavelengths."""
     n = np.array([indices(find_glass(name), WAVES) for name in (crown, flint)])
     u, w = (n - 1) / (n[:, 1:2] - 1)
     u, w = u - u.mean(), w - w.mean()
@@ -50,7 +49,8 @@ VARY = [
 
 @functools.cache
 def snapped():
-    """The optimum of a slow doublet of model glasses, its real glasses, and what that compiled."""
+    """The optimum of a slow doublet of model glasses, the lens with real glasses, and what this
+    compiled."""
     lens = drt_jax.load_lens(DOUBLET)
     solves = [Solve("focal_length", FOCAL, surface=2, wavelengths=(WAVES[1],))]
     operands = [Operand("spot", weight=1e3), Operand("glass_map", high=0.0)]
@@ -72,8 +72,9 @@ def snapped():
 
 @pytest.mark.slow
 def test_no_other_glass_makes_a_thin_doublet_better():
-    """Every alternative has the spot of the closed form, and none in the end is smaller than that
-    of the pair; the chromatic focal shift is the textbook's, (P1 - P2) / (v1 - v2)."""
+    """Every alternative has the spot of the closed form, and no spot at the end is smaller than
+    that of the chosen pair. The chromatic focal shift is that of the textbook, (P1 - P2) / (v1 -
+    v2)."""
     best = snapped()[2]
     pair = best.lens.glasses[1:3]
     assert {*pair} <= {*NAMES} and pair[0] != pair[1]
@@ -84,7 +85,7 @@ def test_no_other_glass_makes_a_thin_doublet_better():
         scores = np.array([score for _, score in ranked])
         wanted, powers = np.transpose([thin(*other(near.glass.name)) for near, _ in ranked])
         assert ranked[0][0].glass.name == pair[place] and len(ranked) == len(NAMES) - 1
-        slim = np.abs(powers) < 10  # not so of nearly equal vd: elements are no longer thin
+        slim = np.abs(powers) < 10  # with nearly equal vd the elements are no longer thin
         assert np.sum(slim) >= len(NAMES) - 2
         np.testing.assert_allclose(scores[slim], size * wanted[slim], rtol=0.01)
         assert np.all(scores >= scores[0]) and np.all(wanted >= 0.99 * wanted[0])
@@ -96,7 +97,7 @@ def test_no_other_glass_makes_a_thin_doublet_better():
     shift = power * partial[0] / v[0] + (1 - power) * partial[1] / v[1]
     np.testing.assert_allclose((foci[1] - foci[0]) / FOCAL, shift, rtol=0.01)
     np.testing.assert_allclose(power, thin(*pair)[1], rtol=1e-3)
-    # Where F and C meet: the smallest spots are next to that.
+    # Where the foci of F and C coincide; the smallest spots are close to this.
     np.testing.assert_allclose(power, v[0] / (v[0] - v[1]), rtol=0.01)
     textbook = (partial[0] - partial[1]) / (v[0] - v[1])
     assert abs(textbook) < 1 / 4500 and abs(shift - textbook) < 1e-4, (pair, textbook, shift)
@@ -104,7 +105,7 @@ def test_no_other_glass_makes_a_thin_doublet_better():
 
 @pytest.mark.slow
 def test_costs_are_told():
-    """Each snap begins where that before it ended; each merit is what the problem says."""
+    """Each exchange starts where the one before it ended; each merit is that of the problem."""
     _, found, best = snapped()
     ends = [found.score, *(snap.after for snap in best.snaps)]
     assert [snap.before for snap in best.snaps] == ends[:-1]
@@ -122,7 +123,8 @@ def test_costs_are_told():
 
 @pytest.mark.slow
 def test_real_glasses_keep_their_formula(tmp_path):
-    """Far outside of F to C too, where nd and vd do not tell the index; and in a file."""
+    """Their indices are right also far outside of F to C, where nd and vd do not determine the
+    index; and in a file."""
     lens = snapped()[2].lens
     waves = np.array([0.4, 0.7, 1.0])
     wanted = [indices(find_glass(name), waves) for name in lens.glasses[1:3]]
@@ -134,7 +136,8 @@ def test_real_glasses_keep_their_formula(tmp_path):
 
 @pytest.mark.slow
 def test_limits_keep_their_names():
-    """Those of the map of glasses, which real ones meet exactly, and those behind them."""
+    """The limits of the glass map, which real glasses fulfil exactly, and the limits behind
+    them."""
     best = snapped()[2]
     maps, length = best.optimum.limits[:2], best.optimum.limits[2]
     assert [(one.kind, one.where, one.value) for one in maps] == [
@@ -196,7 +199,8 @@ LINES = (WAVES, np.array([0.6562725, 0.75, 0.8521101]))  # by day and by night
 
 
 def thin_by_day_and_night(crown, flint):
-    """`thin` of a doublet that is focused at three lines by day and at three by night."""
+    """`thin` for a doublet that is focused at three wavelengths for the day and at three for the
+    night."""
     pairs = []
     for lines in LINES:
         n = np.array([indices(find_glass(name), lines) for name in (crown, flint)])
@@ -210,7 +214,7 @@ def thin_by_day_and_night(crown, flint):
 
 @pytest.mark.slow
 def test_one_pair_of_glasses_serves_all_configurations():
-    """A slow doublet by day and by night, refocused: each exchange as thin lenses have it."""
+    """A slow doublet for day and night, refocused: each exchange agrees with thin lenses."""
     lens, problems = drt_jax.load_lens(DOUBLET), []
     focal = Operand("effective_focal_length", low=FOCAL - 1e-3, high=FOCAL + 1e-3)
     for lines in LINES:
@@ -231,14 +235,15 @@ def test_one_pair_of_glasses_serves_all_configurations():
     size = (1e3 * SEMI) ** 2 / 2
     np.testing.assert_allclose(best.optimum.merit, size * thin_by_day_and_night(*pair), rtol=0.02)
     np.testing.assert_allclose(best.problem.merit(best.optimum.vector), best.optimum.merit)
-    for name in NAMES:  # no other glass in one place is better
+    for name in NAMES:  # no exchange of a single glass is better
         for other in ((name, pair[1]), (pair[0], name)):
             if other[0] != other[1]:
                 assert thin_by_day_and_night(*other) > 0.98 * thin_by_day_and_night(*pair)
 
 
 def test_glasses_of_configurations_are_shared():
-    """Two lengths of one lens, without rays: a glass goes into both; none of its own is taken."""
+    """Two lengths of one lens, without rays: a glass is set in both. Model glasses that are
+    separate for the configurations are refused."""
     rows = [{"radius": "inf", "thickness": 1.0, "nd": 1.52, "vd": 64.0, "stop": True}]
     rows[0]["semi_diameter"] = 1.0
     lens = drt_jax.load_lens({"surfaces": [*rows, {"radius": "inf"}], "sensor": 9.0})
@@ -260,7 +265,7 @@ def test_glasses_of_configurations_are_shared():
 
 
 def test_tied_glasses_are_one():
-    """Crown, flint, crown; nd and vd of the crowns are tied, and are one glass in the end."""
+    """Crown, flint, crown: nd and vd of the crowns are tied, and the crowns get the same glass."""
     rows = [
         {"radius": np.inf, "thickness": 1.0, "nd": nd, "vd": vd}
         for nd, vd in ((1.52, 64), (1.62, 36), (1.52, 64))
@@ -270,7 +275,7 @@ def test_tied_glasses_are_one():
     )
     ties = [Tie((0, 2), kind=kind) for kind in ("index", "abbe")]
     variables = Variables.from_lens(lens, ["index", "abbe", "sensor"], ties)
-    # No rays: a target length that the sensor has; all glasses are alike.
+    # No rays: the operand is the length, at its target; all glasses have the same merit.
     problem = design.Problem.from_variables(variables, [Operand("total_track", target=9.5)])
     found = design.optimise(problem, max_steps=5)
     best = design.snap_glasses(problem, found, count=2, steps=2, max_steps=3)
@@ -279,8 +284,9 @@ def test_tied_glasses_are_one():
 
 
 def test_glasses_that_are_sold_today():
-    """SF6G05 is against radiation, N-LASF31 was replaced by N-LASF31A, N-SF6HT has the constants of
-    N-SF6, LAK9G15 and N-LAF3 are made on inquiry; PMMA is no glass, IRG24 is black."""
+    """SF6G05 is radiation resistant, N-LASF31 was replaced by N-LASF31A, N-SF6HT has the constants
+    of N-SF6, LAK9G15 and N-LAF3 are made on inquiry; PMMA is not a glass, IRG24 is opaque to
+    visible light."""
     ordinary = ("N-BK7", "N-SF6", "SF6", "F2", "N-LASF31A", "N-PK51", "S-FPL51", "H-K9L", "FCD1")
     others = ("SF6G05", "N-LASF31", "N-SF6HT", "N-SF57HTultra", "FK5HTi", "LAK9G15", "N-LAF3")
     others += ("BK7_SCHOTT", "PMMA", "IRG24", "SF15", "BSM16")

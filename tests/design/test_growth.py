@@ -1,4 +1,4 @@
-"""Growth of a singlet whose optimum another program found, see `test_optimum`."""
+"""Growth of a singlet whose optimum is known from another program, see `test_optimum`."""
 
 import pytest
 
@@ -30,7 +30,7 @@ def test_a_lens_grows_to_its_whole_aperture_and_to_its_optimum(problem):
 
 @pytest.mark.slow
 def test_growth_ends_where_the_target_is_out_of_reach(problem):
-    """Spherical aberration of third order: r^2 of a spot goes with the sixth power of the
+    """By third-order spherical aberration, r^2 of a spot is proportional to the sixth power of the
     aperture."""
     target = 0.1 * OPTIMUM
     found = design.grow(problem, target)

@@ -1,4 +1,4 @@
-"""A thin meniscus at a surface: the saddle point, and the ways down from it."""
+"""A thin meniscus at a surface: the saddle point, and the descents from it in both directions."""
 
 import dataclasses
 import sys
@@ -21,8 +21,8 @@ def problem_of(lens):
 
 
 def test_two_lines_of_equal_merit_cross_at_a_thin_meniscus():
-    """With c the curvature of the surface, (c, u, u) and (u, u, c) are nearly null elements; a
-    change of the middle curvature alone is none."""
+    """With c the curvature of the surface, menisci (c, u, u) and (u, u, c) change nearly nothing; a
+    change of the middle curvature alone does."""
     lens = design.open_apertures(drt_jax.load_lens(LENS))
     thin = design.inserted(lens, 1, 1, distance=0.05, thickness=0.05)  # behind the last surface
     problem = problem_of(thin)

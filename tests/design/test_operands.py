@@ -1,4 +1,4 @@
-"""Operands: their values by other routes, and what is said where they do not fit."""
+"""Values of operands, computed in other ways; and errors for lenses to which they do not apply."""
 
 import dataclasses
 import pathlib
@@ -39,7 +39,7 @@ VIEWS = [(field, distance) for distance in DISTANCES for field in FIELDS]
 
 
 def program(problem, kinds):
-    """The values of kinds, by name, as one function of the problem and the vector."""
+    """A function of the problem and the vector that returns the values of kinds by name."""
 
     def values(problem, vector):
         lens = problem.variables.lens_of(vector)
@@ -50,14 +50,14 @@ def program(problem, kinds):
 
 
 def values_of(lens, kinds, scene, rule):
-    """The values of kinds, by name, of a lens as it is."""
+    """The values of kinds, by name, of a given lens."""
     problem = Problem.from_variables(Variables.from_lens(lens, ["sensor"]), kinds, scene, rule)
     return program(problem, kinds)(problem, problem.variables.start)
 
 
 @pytest.fixture(scope="module")
 def triplet():
-    """The Cooke triplet, what all operands say of it, and the rule of its rays."""
+    """The Cooke triplet, the values of all operands, and the rule of its rays."""
     lens, rule = load_lens("cooke_triplet"), Gauss(4, "bilateral")
     variables = Variables.from_lens(lens, ["curvature"])
     none = "magnification", "glass_map"
@@ -69,7 +69,7 @@ def triplet():
 
 @pytest.mark.slow
 def test_spots(triplet):
-    """Sums of squares are traces of covariances, of colours apart or together."""
+    """Sums of squares are traces of covariances, for wavelengths separately or together."""
     lens, rule, told = triplet
     for k, (field, distance) in enumerate(VIEWS):
         found = drt_jax.psf_moments(lens, Scene.point(field, distance, COLOURS), sampling=rule)
@@ -112,7 +112,7 @@ def test_first_order(triplet):
     wide = 2 * found[0].entrance_pupil.semi_diameter[1]
     np.testing.assert_allclose(told["entrance_pupil"], [wide], rtol=1e-13)
     np.testing.assert_allclose(told["f_number"], [f.f_number[1] for f in found], rtol=1e-13)
-    # The prescription: f/5, 10 mm; what is printed of it.
+    # The prescription is f/5, 10 mm; these are its printed values.
     assert abs(told["f_number"][0] - 5) < 2e-3 and abs(told["entrance_pupil"][0] - 10) < 3e-3
     ends = 3.25896 + 6.00755 + 0.99997 + 4.75041 + 2.95208
     assert abs(told["length"][0] - ends) < 1e-12
@@ -122,7 +122,7 @@ def test_first_order(triplet):
 
 @pytest.mark.slow
 def test_chief_rays(triplet):
-    """Distortion and lateral colour by `image_point`, angles by the direction cosines."""
+    """Distortion and lateral colour agree with `image_point`, angles with the direction cosines."""
     lens, _, told = triplet
     focal = float(drt_jax.focal_length(lens, COLOURS[1])[0])
     for k, (field, distance) in enumerate(VIEWS):
@@ -144,8 +144,8 @@ def test_chief_rays(triplet):
 
 @pytest.mark.slow
 def test_numerical_apertures(triplet):
-    """n sin of the angle between the chief ray and those through the rim, by the direction cosines;
-    on the axis near the paraxial one."""
+    """n sin of the angle between the chief ray and the marginal rays, by the direction cosines;
+    close to the paraxial value on the axis."""
     lens, _, told = triplet
     rim = [[0.0, 0.0], [0.0, 1.0], [0.0, -1.0], [1.0, 0.0], [-1.0, 0.0]]
     for k, (field, distance) in enumerate(VIEWS):
@@ -161,7 +161,8 @@ def test_numerical_apertures(triplet):
 
 @pytest.mark.slow
 def test_incidence(triplet):
-    """The largest angle between directions and normals, these by differences of the sag."""
+    """The largest angle between directions and normals; the normals are by differences of the
+    sag."""
     lens, rule, told = triplet
     points = np.asarray(pupil_points(lens, Scene.point(0.1, np.inf, COLOURS), rule)[0])[0]
     points = np.concatenate([points, [[0, 0], [0, 1], [0, -1], [1, 0]]])
@@ -185,7 +186,7 @@ def test_thickness_at_edges(triplet):
     lens, _, told = triplet
     semi, zones = np.array(lens.semi_diameter), np.array([0.5, 0.7, 0.85, 1.0])
     gaps = np.append(lens.thickness, lens.sensor - np.sum(lens.thickness))
-    semi[6] = semi[5]  # the sensor is as wide as need be
+    semi[6] = semi[5]  # the sensor is wide enough
     for name, rows, wide in (("glass", (0, 2, 4), max), ("air", (1, 3, 5), min)):
         on_axis = gaps[list(rows)]
         np.testing.assert_allclose(told[f"{name}_centre"], on_axis, rtol=1e-14)
@@ -211,8 +212,9 @@ def test_open_apertures_reach_as_far_as_the_rays(tmp_path):
 
 
 def flux(lens, field, count=400, h=1e-4):
-    """Light of a distant object on the sensor: the area of the beam on the plane z = 0, times the
-    solid angle, in direction cosines, that an area of the sensor sees."""
+    """Light of a distant object on the sensor: the area of the beam in the plane z = 0, times the
+    solid angle, in direction cosines, of the part of the object that is imaged onto an area of the
+    sensor."""
     angle = 2 * np.pi * np.arange(count) / count
     rim = np.stack([np.cos(angle), np.sin(angle)], axis=1)
     rays = drt_jax.trace_rays(lens, Scene.point(field, np.inf, COLOURS[1]), rim)
@@ -259,7 +261,8 @@ surfaces:
 @pytest.mark.slow
 @pytest.mark.parametrize("semi, rule", [(100, 4), (15, Clipped(6, "bilateral"))])
 def test_illumination_of_a_thin_lens(tmp_path, semi, rule):
-    """The fourth power of the cosine, times the light that passes a clear aperture far in front."""
+    """The fourth power of the cosine, times the fraction of the light that passes a clear aperture
+    far in front."""
     path = tmp_path / "weak.yaml"
     path.write_text(WEAK.format(semi=semi))
     lens = load_lens(path)
@@ -276,14 +279,15 @@ def test_illumination_of_a_thin_lens(tmp_path, semi, rule):
     found, passed = told(lens)
     share = passed[1, 0] / passed[0, 0]
     assert share == 1 if semi == 100 else 0.4 < share < 0.6
-    # What is left of the stop lies to one side of its middle.
+    # The open part of the stop lies on one side of its centre.
     near = 2e-3 if semi == 100 else 1e-2
     assert abs(found[1] / (np.cos(fields[1]) ** 4 * share) - 1) < near
 
 
 @pytest.mark.slow
 def test_operands_of_an_afocal_lens_are_its_analyses():
-    """Angles, the light on a pixel, no paraxial image; on the axis no centroid."""
+    """Angles and the light on a pixel agree with the analyses, there is no paraxial image, and the
+    centroid on the axis is 0."""
     scene, rule = Scene.radians([0.0, 0.002, 0.004], np.inf, 0.5), Gauss(6, "bilateral")
     told = values_of(TELESCOPE, ["chief_ray_angle", "relative_illumination"], scene, rule)
     angles = drt_jax.chief_ray_angle(TELESCOPE, scene)[:, 0]
@@ -296,7 +300,7 @@ def test_operands_of_an_afocal_lens_are_its_analyses():
 
 @pytest.mark.slow
 def test_a_centroid_on_the_axis_is_there():
-    """Rays on one radius stand for all azimuths."""
+    """Rays on one radius represent all azimuths."""
     lens, scene = load_lens("singlet"), Scene.radians([0.0], np.inf, COLOURS)
     told = values_of(lens, ["centroid", "rms_spot"], scene, Gauss(4, "rotational"))
     whole = values_of(lens, ["rms_spot"], scene, Gauss(4, "none"))
@@ -306,7 +310,7 @@ def test_a_centroid_on_the_axis_is_there():
 
 @pytest.mark.slow
 def test_vignetted_spots():
-    """By a rule fitted to what is left of the pupil."""
+    """Spots by a rule fitted to the open part of the pupil."""
     lens, rule, field = load_lens("camera_50mm"), Clipped(4, "bilateral"), np.radians(20)
     problem = Problem.from_variables(
         Variables.from_lens(lens, ["thickness"]),
@@ -328,7 +332,7 @@ def test_vignetted_spots():
 
 
 def beam(lens, vary, rule, **given):
-    """A problem of the Petzval lens from two fields, of which clear apertures cut the second."""
+    """A problem of the Petzval lens with two fields, of which clear apertures clip the second."""
     fields = np.radians([0.0, 8.0])
     kinds = ("spot", "rms_spot", "rms_wavefront", "centroid")
     wanted = [*(Operand(kind, **given) for kind in kinds), "throughput"]
@@ -345,7 +349,8 @@ def judged(problem, lens):
 
 @pytest.mark.slow
 def test_spots_without_vignetting():
-    """As if no clear aperture were there: narrower ones cut light and spots, these stay."""
+    """Spots are those of the lens without clear apertures: narrower apertures change light and
+    vignetted spots, but not these."""
     lens, rule = load_lens("petzval_100mm"), Gauss(6, "bilateral")
     narrow = dataclasses.replace(lens, semi_diameter=lens.semi_diameter.at[5].set(13.0))
     free = jnp.full_like(lens.semi_diameter, jnp.inf)
@@ -367,7 +372,8 @@ def test_spots_without_vignetting():
 
 @pytest.mark.slow
 def test_apertures_as_variables_do_not_vignette():
-    """With spots of what arrives they close, with those of the whole stop they stay."""
+    """With spots of the light that arrives, apertures close; with spots of the whole stop they stay
+    open."""
     lens, rule = load_lens("petzval_100mm"), Soft(5, "bilateral", 1.0)
     vary = ["sensor", design.Vary("curvature", (5,))]
     vary.append(design.Vary("semi_diameter", (3, 4, 5), low=10.0, high=25.0))
@@ -383,7 +389,7 @@ def test_apertures_as_variables_do_not_vignette():
 
 @pytest.mark.slow
 def test_glasses_stay_on_the_map():
-    """A doublet whose glasses vary: without the limit they end where no glass is."""
+    """A doublet with variable glasses: without the limit they end in a region without glasses."""
     lens = drt_jax.with_model_glass(load_lens(DOUBLET))
     free = ["curvature", "index", "abbe", "sensor"]
     variables = Variables.from_lens(lens, free, solves=[Solve("focal_length", 100.0, surface=2)])

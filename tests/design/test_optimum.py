@@ -1,4 +1,4 @@
-"""Least squares within bounds and limits, and many starts: against known optima."""
+"""Least squares within bounds and limits, and many starts, compared with known optima."""
 
 import dataclasses
 import types
@@ -15,7 +15,7 @@ from drt_jax.design import Operand, Solve, Variables, Vary, least_squares
 from drt_jax.design.limits import refuse_fixed
 from drt_jax.design.starts import distinct
 
-# Of the singlet of issue 14, by another program: merit at the start and at the optimum, mm^2.
+# The singlet of issue 14, by another program: merit at the start and at the optimum, mm^2.
 START, OPTIMUM = 30.0924206902, 0.00172898452577
 SINGLET = """
 surfaces:
@@ -26,7 +26,7 @@ sensor: 37
 
 
 def solved(function, start, low, high):
-    """By the method alone, in one program: the vector, the search."""
+    """Least squares alone, in one program: the vector and the search."""
 
     def values(y):
         residuals, constraints = function(y)
@@ -58,7 +58,8 @@ def test_bounded_minima_are_those_of_scipy(upper):
 
 
 def test_constraints_hold_exactly():
-    """min (x - 3)^2 + (y - 1)^2 where x + y <= 2: at (2, 0); where x + y <= 11: at (3, 1)."""
+    """min (x - 3)^2 + (y - 1)^2 subject to x + y <= 2 is at (2, 0), subject to x + y <= 11 at (3,
+    1)."""
 
     def function(y, most=2.0):
         return jnp.stack([y[0] - 3, y[1] - 1]), 100 * (y[:1] + y[1:] - most)
@@ -72,7 +73,8 @@ def test_constraints_hold_exactly():
 
 
 def test_a_printed_optimum_is_a_few_lines():
-    """Merit, active limits by name, variables in the units of the lens, and those at a bound."""
+    """It has the merit, active limits by name, variables in the units of the lens, and variables at
+    a bound."""
     lens = drt_jax.load_lens("cooke_triplet")
     variables = Variables.from_lens(lens, [Vary("sensor", low=40.0, high=45.0)])
     limits = [design.Limit("total_track", "", "high", 60.0, 0.0)]
@@ -98,7 +100,7 @@ def grid(rings):
 
 @pytest.mark.slow
 def test_singlet_reaches_the_known_optimum_in_twenty_jacobians(tmp_path):
-    """From both signs and from a plane plate; one program serves all three."""
+    """From starts of both signs and from a plane plate; all three share one program."""
     for first, second in ((1000, -1000), (-1000, 1000), ("inf", "inf")):
         path = tmp_path / "singlet.yaml"
         path.write_text(SINGLET.format(first, second))
@@ -115,7 +117,7 @@ def test_singlet_reaches_the_known_optimum_in_twenty_jacobians(tmp_path):
 
 @pytest.mark.slow
 def test_a_diffractive_plate_learns_to_focus():
-    """From no phase to that of a focus, (f - sqrt(f^2 + r^2)) / wavelength: a Fresnel lens."""
+    """From no phase to the phase of a focus, (f - sqrt(f^2 + r^2)) / wavelength: a Fresnel lens."""
     f, green = 100.0, 0.55
     phase = {"coefficients": {2: 0.0, 4: 0.0, 6: 0.0}}
     plate = {"radius": "inf", "semi_diameter": 8.0, "stop": True, "phase": phase}
@@ -170,7 +172,7 @@ def test_limits_are_kept_exactly_and_the_best_is_no_worse(triplet):
 
 @pytest.mark.slow
 def test_a_search_ends_as_soon_as_it_is_good(triplet):
-    """By its merit and its limits together, at the first trial of which that is true."""
+    """It ends at the first trial at which both merit and limits are good enough."""
     whole = design.optimise(triplet, max_steps=40)
     good = float(whole.history[10, 0])
     found = design.optimise(triplet, max_steps=40, target_merit=good)
@@ -184,15 +186,17 @@ def test_a_search_ends_as_soon_as_it_is_good(triplet):
 
 @pytest.mark.slow
 def test_limits_are_kept_where_trials_are_used_up(triplet):
-    """A search that is left before its multipliers have settled is mended by some more trials."""
+    """If the trials are used up before the multipliers have converged, some further trials restore
+    the limits."""
     found = design.optimise(triplet, max_steps=10)
     assert found.history[-1, 1] > 1e-9 and found.max_violation == 0 and found.ended == "steps"
     assert float(found.lens.sensor) <= 55 and found.merit < 2 * found.history[-1, 0]
 
 
 def test_limits_that_are_met_in_the_end_are_not_why_it_ended():
-    """Of a light limit the multipliers have not settled after 30 rounds: by 1 / (1 + w^2) each; the
-    last steps mend it. Of two that contradict each other, nothing does."""
+    """For a limit of a small weight w, each round multiplies the error of the multipliers by 1 / (1
+    + w^2); they have not converged after 30 rounds, and the last steps restore the limit. Two
+    limits that contradict each other stay violated."""
     lens = drt_jax.load_lens("singlet")
     variables = Variables.from_lens(lens, ["sensor"])
     length = float(lens.sensor)
@@ -208,8 +212,9 @@ def test_limits_that_are_met_in_the_end_are_not_why_it_ended():
 
 @pytest.mark.slow
 def test_an_optimum_says_whether_it_converged_and_names_its_limits(triplet):
-    """Of limits that cannot be kept together, the worst one by kind, surface, zone and amount."""
-    # Without a limit for air the search ends where surfaces touch, which is no optimum.
+    """If limits cannot be kept together, it names the worst one by kind, surface, zone and
+    amount."""
+    # Without a limit for air gaps the search ends where surfaces touch, which is not an optimum.
     assert design.optimise(triplet).ended == "stuck"
     scene = Scene.degrees([0.0, 14.0], wavelengths=0.5876)
     apart = *triplet.operands, Operand("air_edge", low=0.1)
@@ -233,7 +238,7 @@ def test_an_optimum_says_whether_it_converged_and_names_its_limits(triplet):
 
 @pytest.mark.slow
 def test_each_limit_has_the_name_of_its_value(triplet):
-    """Of each kind, the names of its values are those of their places in the arrays."""
+    """For each kind, the names of its values are in the order of the arrays."""
     kinds = [kind for kind, value in design.OPERANDS.items() if not value.squared]
     kinds = [kind for kind in kinds if kind not in ("magnification", "glass_map")]
     lens, lows = triplet.variables.lens, -1e9
@@ -261,7 +266,8 @@ def test_each_limit_has_the_name_of_its_value(triplet):
 
 @pytest.mark.slow
 def test_a_limit_that_nothing_moves_is_refused(triplet):
-    """Where it is exceeded: of those that need no rays with the problem, else with the search."""
+    """If it is violated: with the problem for limits that need no rays, otherwise with the
+    search."""
     lens = triplet.variables.lens
     bent = Variables.from_lens(
         lens, [Vary("curvature", (4,))], solves=[Solve("focal_length", surface=5)]
@@ -277,7 +283,7 @@ def test_a_limit_that_nothing_moves_is_refused(triplet):
     )
     with pytest.raises(ValueError, match="glass_edge of surface 2, zone .*no variable moves it"):
         design.optimise(problem, max_steps=3)
-    # Those of rays that fail stay where they are until they pass.
+    # The values of failing rays do not change before the rays pass.
     bounded = design.Problem.from_variables(
         bent, ["spot", Operand("distortion", low=-0.05)], Scene.radians(0.3, wavelengths=0.5876)
     )
@@ -286,7 +292,8 @@ def test_a_limit_that_nothing_moves_is_refused(triplet):
 
 @pytest.mark.slow
 def test_weights_of_fields(triplet):
-    """They weigh squares, 1 on the average; 0 leaves a field out."""
+    """Weights multiply squares, and are normalised to the mean 1; a field of weight 0 is left
+    out."""
     start = triplet.variables.start
 
     def merit(fields, **given):
@@ -307,7 +314,7 @@ def test_weights_of_fields(triplet):
 
 
 def test_searches_that_end_at_one_place_are_one_minimum():
-    """Also where a limit stays violated, whose square is in the score."""
+    """Also if a limit stays violated, whose square is part of the score."""
     ends = types.SimpleNamespace(
         score=[2.0, 2.0001, 2.1, np.inf],
         merit=[1.0, 1.0001, 1.1, 1.0],
@@ -320,7 +327,7 @@ def test_searches_that_end_at_one_place_are_one_minimum():
 
 @pytest.mark.slow
 def test_many_starts_do_not_depend_on_threads(triplet):
-    """Two tiles, one of them not full, and a start that no light passes."""
+    """Two tiles, one of them not full, and a start at which no ray passes."""
     starts = design.normal_starts(triplet.variables, 18, 2.0, 3)
     starts[5, :4] = [24.0, -24.0, 24.0, -24.0]
     one, two = (

@@ -41,7 +41,7 @@ def perturbed(lens, *tolerances):
 
 
 def same(ours, wanted):
-    """Lenses alike in all that is told of them."""
+    """Asserts that lenses agree in all numbers and names."""
     for name in ("curvature", "conic", "thickness", "sensor"):
         assert_close(getattr(ours, name), getattr(wanted, name), 1e-13)
     z, across, turned = wanted.places
@@ -92,8 +92,8 @@ def test_decentres_and_tilts_are_those_of_elements_in_a_prescription():
 
 
 def test_elements_move_within_those_of_the_prescription():
-    """An error moves an element as it is in its cell; the cell then has its own place, the surface
-    in it another: three rigid motions, one after the other."""
+    """An error moves an element in its cell; the cell has its own position, and the surface has one
+    in the cell: three rigid motions in sequence."""
     cell = {"surfaces": [4, "sensor"], "tilt": [10, 0, 0], "shift": [0, 1, 0]}
     inner = {"surfaces": [5, 5], "shift": [0.3, 0, 0]}
     lens = lens_of(elements=[inner, cell])
@@ -156,7 +156,8 @@ def test_radius_and_thickness_are_those_of_a_prescription():
 
 @pytest.mark.parametrize("surface", [0, 1, 2])
 def test_fringes_are_between_rim_and_nominal_surface(surface):
-    """On a sphere, the distance of the rim from the other sphere, told from its centre."""
+    """On a sphere, the distance of the rim from the nominal sphere, measured from the centre of the
+    nominal sphere."""
     lens = lens_of()
     some = perturbed(lens, Tolerance("fringes", 4.0, (surface,)))
     bent = some.lens_of(jnp.ones(1))
@@ -226,7 +227,7 @@ def test_errors_have_derivatives_and_keep_the_dtype():
 
 
 def leaves(lens):
-    """The arrays of a lens that are differentiated."""
+    """The arrays of a lens with respect to which derivatives are taken."""
     return [a for a in jax.tree.leaves(lens) if jnp.issubdtype(a.dtype, jnp.floating)]
 
 

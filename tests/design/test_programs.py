@@ -1,4 +1,5 @@
-"""Numbers and names are leaves or labels: other ones compile nothing. And a user's own operand."""
+"""Numbers are leaves and names are labels: other ones compile nothing. Also an operand that is a
+user's function."""
 
 import dataclasses
 
@@ -21,7 +22,7 @@ ROWS = [
 
 
 def coma(lens, rays):
-    """Centroid less the chief ray, y in mm, of each view: an operand as a user writes one."""
+    """Centroid minus chief ray, y in mm, of each view: an operand as a user writes one."""
     y, weights = rays.sensor_hits[-1], rays.weights
     return jnp.sum(weights * (y - y[..., :1]), axis=-1)
 
@@ -33,7 +34,7 @@ def lens_of(name, glasses):
 
 
 def searched(k):
-    """All of a design, its numbers and names other ones for each k."""
+    """All steps of a design, with other numbers and names for each k."""
     glasses = (("N-BK7", "F2"), ("N-SK16", "F2"), ("SK16", "SF2"))[k]
     lens = lens_of(("one", "two", "three")[k], glasses)
     variables = Variables.from_lens(
@@ -63,7 +64,7 @@ def searched(k):
 @pytest.mark.slow
 def test_other_numbers_and_names_compile_nothing(caplog):
     searched(0)
-    searched(1)  # the range of a glass, and the like, may be asked for the first time
+    searched(1)  # some values, such as the range of a glass, are needed here for the first time
     caplog.clear()
     with jax.log_compiles():
         found = searched(2)[1]
@@ -82,7 +83,7 @@ def test_lenses_of_other_names_stack():
     assert focal._cache_size() == 1
     both = jax.tree.map(lambda *a: jnp.stack(a), *lenses)
     np.testing.assert_allclose(jax.vmap(focal)(both), np.stack(wanted), rtol=1e-14)
-    # What a program returns names nothing, rather than the lens that it was compiled with.
+    # A lens that a program returns has no name, not that of the lens for which it was compiled.
     assert jax.jit(lambda lens: lens)(lenses[1]).name == ""
     water = dataclasses.replace(lenses[0], labels=lenses[0].labels.unnamed)
     assert jax.tree.structure(water) == jax.tree.structure(lenses[1])
@@ -94,7 +95,7 @@ def test_lenses_of_other_names_stack():
 
 @pytest.mark.slow
 def test_a_function_is_an_operand():
-    """As residuals and as limits that are told by its name; with derivatives."""
+    """As residuals, and as limits that are reported by its name; with derivatives."""
     problem, found = searched(0)
     lens = problem.variables.lens_of(problem.variables.start)
     rays = trace_fields(problem, lens)

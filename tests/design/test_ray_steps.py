@@ -1,4 +1,5 @@
-"""Steps of a lens that are measured by its rays, and the projection onto limits in a metric."""
+"""Steps of a lens that are measured by the motion of its rays, and the projection onto limits in a
+metric."""
 
 import jax
 import jax.numpy as jnp
@@ -12,7 +13,7 @@ from drt_jax.design.within_limits import nearest
 
 @pytest.mark.parametrize("seed", range(20))
 def test_the_nearest_vector_is_that_of_scipy(seed):
-    """Metrics of condition 1e8, rows that are nearly parallel, repeated, or zero."""
+    """Metrics with the condition 1e8; rows that are nearly parallel, repeated, or zero."""
     rng = np.random.default_rng(seed)
     count, rows = 9, 14
     turn = np.linalg.qr(rng.normal(size=(count, count)))[0]
@@ -100,7 +101,7 @@ def test_a_step_moves_the_rays_by_its_size_and_no_unit_counts(triplet):
 
 @pytest.mark.slow
 def test_no_step_exceeds_a_share_of_the_spots(triplet):
-    """Steps far above the spots led a phone lens away from spots of 0.1 um."""
+    """Steps much larger than the spots moved a phone lens away from spots of 0.1 um."""
     spots, limits = triplet
     start = spots.variables.start
     gradient = jax.grad(spots.merit)(start + 0.01)
@@ -116,7 +117,7 @@ def test_no_step_exceeds_a_share_of_the_spots(triplet):
 
 @pytest.mark.slow
 def test_it_ends_where_least_squares_ends_within_bounds_and_limits(triplet):
-    """From a spoilt lens, by exact gradients of the spots."""
+    """From a disturbed lens, with exact gradients of the spots."""
     spots, limits = triplet
     start = design.as_built_starts(spots.variables, 1, 3.0, 0.05, 0)[0]
     start = jnp.clip(start, spots.variables.low, spots.variables.high)

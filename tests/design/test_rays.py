@@ -1,4 +1,4 @@
-"""No merit, spot or yield counts a ray as failed that the full search finds."""
+"""Merits, spots and yields count no ray as failed that the full search finds."""
 
 import dataclasses
 
@@ -16,8 +16,8 @@ from drt_jax.rays.find import find, find_aimed
 from ..known import aims
 
 RGB = (0.486, 0.588, 0.656)
-# Opened wider, and seen from farther off the axis, than they are made for: of these the paraxial
-# launch of 4 to 17 % of the rays misses the lens.
+# Wider apertures and larger fields than those for which the lenses are made: the paraxial launch of
+# 4 to 17 % of the rays misses the lens.
 WIDE = (
     ("phone", 1.35, 24),
     ("telephoto_300mm", 1.1, 10),
@@ -27,7 +27,7 @@ WIDE = (
 
 
 def opened(name, factor):
-    """A lens whose stop is larger, without any other rim."""
+    """A lens with a larger stop, and without any other aperture."""
     lens = drt_jax.load_lens(name)
     stop = np.arange(lens.count + 1) == lens.stop
     wide = jnp.where(stop, factor * lens.semi_diameter, jnp.inf)
@@ -55,7 +55,7 @@ def test_aiming_finds_what_the_full_search_finds(name, factor, degrees):
 
 @pytest.mark.slow
 def test_spots_of_a_design_are_those_of_the_moments():
-    """A fifth of the rays fails: what is left is weighed as by `psf_moments`."""
+    """A fifth of the rays fail: the others have the weights of `psf_moments`."""
     lens, field = opened("phone", 1.5), np.radians(14.0)
     variables = design.Variables.from_lens(lens, [Vary("curvature")])
     rule = drt_jax.Gauss(6, "bilateral")
@@ -75,7 +75,7 @@ def test_spots_of_a_design_are_those_of_the_moments():
 
 @pytest.mark.slow
 def test_lenses_as_built_are_searched_in_full(monkeypatch):
-    """Of whatever aiming misses, here every ray, the full search finds all."""
+    """The full search finds all rays that aiming misses, which are all rays here."""
     lens = opened("cooke_triplet", 1.0)
     variables = design.Variables.from_lens(lens, [Vary("curvature")])
     rule = drt_jax.Gauss(3, "none")
@@ -100,7 +100,7 @@ def test_lenses_as_built_are_searched_in_full(monkeypatch):
 
 @pytest.mark.slow
 def test_an_optimum_is_searched_in_full(monkeypatch):
-    """The same of a search for an optimum."""
+    """The same for the search for an optimum."""
     variables = design.Variables.from_lens(drt_jax.load_lens("singlet"), ["sensor"])
     problem = design.Problem.from_variables(
         variables, ["spot"], Scene.radians([0.0], wavelengths=(0.55,)), 3

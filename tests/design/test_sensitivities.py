@@ -1,4 +1,5 @@
-"""Sensitivity tables, compensators, criteria and grades beside lenses disturbed by hand."""
+"""Sensitivity tables, compensators, criteria and grades, compared with lenses that are changed by
+hand."""
 
 import csv
 import dataclasses
@@ -25,7 +26,7 @@ BOTH = [Tolerance("sensor", 3.0), Tolerance("thickness", 0.5, (0,))]
 
 @pytest.fixture(scope="module")
 def singlet():
-    """A singlet with a wrong thickness and a decentre, and what evaluates it."""
+    """A singlet with errors of a thickness and a decentre, and the problem that evaluates it."""
     some = PerturbedLens.from_lens(SINGLET, jnp.array([5.0, 6.0, 6.0]), ERRORS)
     variables = Variables.from_lens(some.lens, ["sensor"])
     scene = Scene.radians(FIELDS, np.inf, [0.5875618])
@@ -36,7 +37,8 @@ _traced = jax.jit(lambda problem, lens: design.as_built(problem, lens, "none").s
 
 
 def spot_of(problem, some, error, sensor=0.0, gap=0.0):
-    """The spot of the lens, disturbed by hand: errors in mm, of the thickness and along x and y."""
+    """The spot of the lens, changed by hand: errors of the thickness and of the decentre along x
+    and y, mm."""
     lens, group = some.lens, some.groups[0]
     thickness = lens.thickness.at[1].add(error[0]).at[0].add(gap)
     # The sensor keeps its distance from the last vertex.
@@ -48,7 +50,7 @@ def spot_of(problem, some, error, sensor=0.0, gap=0.0):
 
 
 def focused(problem, some, error):
-    """The best spot by a scan of the sensor, and where it is."""
+    """The smallest spot by a scan of the sensor, and the position of the sensor."""
     spot = lambda move: spot_of(problem, some, error, move)  # noqa: E731
     best = optimize.minimize_scalar(spot, bracket=(-0.5, 0.5), tol=1e-8)
     return best.fun, best.x
@@ -100,7 +102,7 @@ def test_compensators_are_where_a_search_within_their_limits_ends(singlet):
         assert best.fun * (1 - 1e-5) < 1e3 * found.value[k] < best.fun * (1 + 1e-9)
         np.testing.assert_allclose(found.moves[k], best.x, atol=2e-3)
     assert np.max(np.abs(found.moves[:, 1])) == pytest.approx(0.5)  # at its limit
-    # The sensor alone, by steps with rays, is the focus of one trace.
+    # Steps with rays for the sensor alone agree with the focus of one trace.
     stepped = design.monte_carlo(problem, some, off, BOTH[:1])
     usual = design.monte_carlo(problem, some, off, "focus")
     np.testing.assert_allclose(stepped.value, usual.value, rtol=1e-9)
@@ -118,7 +120,7 @@ def test_any_operand_is_a_criterion(singlet):
     boresight = Assembly("none", Operand("centroid", fields=(0,)))
     off = np.eye(3)
     found = design.monte_carlo(problem, some, off, boresight).value
-    # A shifted thin lens moves the image of a far point as it moves.
+    # A thin lens that is shifted moves the image of a far point by the same amount.
     np.testing.assert_allclose(found, [0, 0, 0.4], atol=0.03)
     own = design.monte_carlo(problem, some, off, Assembly("none", height)).value
     np.testing.assert_allclose(own, found, atol=0.01)
@@ -145,7 +147,7 @@ def test_transfer_as_criterion_is_that_of_the_refocused_lens(singlet):
 
 @pytest.mark.slow
 def test_second_derivatives_of_a_transfer_function():
-    """Compiled without any optimisation, this program gave NaN."""
+    """Compiled without any optimisation, this program returned NaN."""
     lens = design.open_apertures(drt_jax.load_lens("cooke_triplet"))
     some = PerturbedLens.from_lens(lens, lens.semi_diameter[:-1], [Tolerance("radius", 0.05)])
     variables = Variables.from_lens(some.lens, ["sensor"])
@@ -175,7 +177,7 @@ def test_inverse_sensitivity_keeps_the_drop(singlet):
     nominal, _ = focused(*singlet, [0.0, 0.0, 0.0])
     spots = [focused(*singlet, [0.0, *row])[0] for row in float(kept.sizes[1]) * np.eye(2)]
     assert max(spots) - nominal == pytest.approx(drop, rel=1e-3)
-    # An error that does too little gets the largest size.
+    # An error with too little effect gets the largest size.
     little = design.inverse_sensitivity(problem, some, "focus", 1e3, most=2.0)
     np.testing.assert_allclose(little.sizes, 2 * some.sizes)
 

@@ -1,4 +1,4 @@
-"""Solves hold exactly, in every lens, and say so where they cannot."""
+"""Solves hold exactly in every lens, and raise errors where they cannot hold."""
 
 import dataclasses
 import functools
@@ -19,7 +19,7 @@ EXACT = 1e-12
 
 @functools.partial(jax.jit, static_argnums=1)
 def held(lens, solve):
-    """What a solve keeps, by what the package says of the lens."""
+    """The quantities that a solve keeps, by other functions of the package."""
     first = drt_jax.first_order(lens, solve.distance, np.array(solve.wavelengths))
     slope = -1 / (2 * first.f_number)
     kinds = {
@@ -57,7 +57,7 @@ CASES = [
 
 @pytest.mark.parametrize("solve", CASES, ids=lambda s: f"{s.kind}-{s.value:g}-{s.surface}")
 def test_conditions_hold_whatever_varies(solve):
-    """To 1e-12, at the start and for random vectors; by `first_order`."""
+    """To 1e-12, at the start and for random vectors; checked by `first_order`."""
     variables = Variables.from_lens(
         load_lens("cooke_triplet"), ["curvature", "thickness"], solves=[solve]
     )
@@ -87,7 +87,7 @@ def test_a_focal_length_in_air_is_kept_in_front_of_water():
 
 @pytest.mark.slow
 def test_all_together_in_any_order():
-    """Given in the order in which they would spoil one another."""
+    """They are given in the order in which each would disturb the one before."""
     solves = [
         Solve("best_focus", 0.0, fields=(0.0, 0.2), wavelengths=COLOURS),
         Solve("f_number", 4.5),
@@ -107,7 +107,7 @@ def test_all_together_in_any_order():
 
 @functools.partial(jax.jit, static_argnums=1)
 def best(lens, solve):
-    """How far the sensor is from the best focus, relative: by moments that know no solve."""
+    """Relative distance of the sensor from the best focus, by moments that do not use a solve."""
     total = jnp.zeros(3)
     for field in solve.fields:
         symmetry = "rotational" if field == 0 else "bilateral"
@@ -122,7 +122,8 @@ def best(lens, solve):
 
 @pytest.mark.slow
 def test_best_focus_is_best():
-    """Beside it the spots are larger, by as much as the parabola says; and `value` is beside it."""
+    """At other positions the spots are larger, by the amount of the parabola; with `value` the
+    sensor is at this distance from the focus."""
     lens = load_lens("cooke_triplet")
     solve = Solve("best_focus", fields=(0.0, 0.25), wavelengths=COLOURS)
     sensor = [
@@ -145,7 +146,8 @@ def test_best_focus_is_best():
 
 @pytest.mark.slow
 def test_solved_numbers_have_derivatives():
-    """In forward and reverse mode, against central differences; the condition itself has none."""
+    """In forward and reverse mode, compared with central differences; the derivative of the
+    condition itself is 0."""
     solves = [Solve("focal_length", surface=5), Solve("f_number"), Solve("best_focus")]
     variables = Variables.from_lens(
         load_lens("cooke_triplet"), ["curvature", "thickness"], solves=solves

@@ -1,4 +1,5 @@
-"""Compensation, derivatives and Monte Carlo beside scans, differences and each other."""
+"""Compensation, derivatives and Monte Carlo, compared with scans, with differences and with each
+other."""
 
 import dataclasses
 import math
@@ -42,7 +43,7 @@ def problem_of(lens, fields=FIELDS, rule=3):
 
 @pytest.fixture(scope="module")
 def singlet():
-    """The singlet with errors of most kinds, and what judges it."""
+    """The singlet with errors of most kinds, and the problem that evaluates it."""
     some = perturbed()
     return problem_of(some.lens), some
 
@@ -61,7 +62,7 @@ def some_lens(some, seed=5):
 
 @pytest.mark.slow
 def test_squares_are_those_of_the_moments(singlet):
-    """The spot of all colours about their centroid, from the moments of each."""
+    """The spot of all wavelengths about their centroid, from the moments of each."""
     problem, some = singlet
     lens = some_lens(some)
     found = drt_jax.psf_moments(
@@ -95,7 +96,7 @@ def test_focus_is_where_a_scan_finds_it(singlet):
 
 @pytest.mark.slow
 def test_tilt_of_the_sensor_is_where_a_scan_finds_it(singlet):
-    """The sensor really tilted, about where the axis meets it."""
+    """The sensor is really tilted, about its intersection with the axis."""
     problem, some = singlet
     lens = some_lens(some)
     found = _made(problem, lens, "focus and tilt")
@@ -112,15 +113,15 @@ def test_tilt_of_the_sensor_is_where_a_scan_finds_it(singlet):
         lambda x: float(spot(jnp.asarray(x * scales))), np.zeros(3), method="Nelder-Mead",
         options={"xatol": 1e-5, "fatol": 1e-9, "maxiter": 400},
     )  # fmt: skip
-    # A sensor that leans also stretches what falls on it, by its angle times that of the light.
+    # A tilted sensor also stretches the spot, by its angle times that of the light.
     np.testing.assert_allclose(best.x * scales, found.moves, rtol=0.1)
     assert best.fun == pytest.approx(1e3 * float(found.spot), rel=1e-3)
 
 
 @pytest.mark.slow
 def test_a_sensor_that_stands_oblique_is_focused_along_the_axis(singlet):
-    """Compensated lenses with their sensors really moved need no more compensation; the spots are
-    the same."""
+    """Compensated lenses whose sensors are really moved need no further compensation, and have the
+    same spots."""
     problem, some = singlet
     tilt = some_lens(some).tilt.at[-1].set(jnp.array([0.5, -0.4, 0.3]))
     lens = dataclasses.replace(some_lens(some), tilt=tilt)
@@ -137,8 +138,8 @@ def measures(singlet, off):
 
 @pytest.mark.slow
 def test_gradient_and_hessian_are_those_of_differences(singlet, predicted):
-    """Central differences: at some step they agree to six digits, and before it the error falls
-    with the square of the step."""
+    """They agree with central differences of some step to six digits; for larger steps the error is
+    proportional to the square of the step."""
     count = len(singlet[1].deviations)
     units = np.eye(count)
     steps = np.array([0.4, 0.2, 0.1, 0.05, 0.01])
@@ -183,7 +184,7 @@ def test_what_rays_know_of_second_derivatives_are_their_products(singlet, predic
 
 @pytest.mark.slow
 def test_predictions_are_monte_carlo(singlet, predicted):
-    """The quadratic of all second derivatives, with errors so small that it holds."""
+    """The quadratic form of all second derivatives, with errors so small that it is accurate."""
     off = 0.1 * design.draw_perturbations(singlet[1], 200, 3)
     true = measures(singlet, off)
     foretold = np.asarray(predicted.at(off, "second"))
@@ -209,7 +210,7 @@ def as_they_are(lens, built):
 @pytest.mark.slow
 @pytest.mark.parametrize("compensator, given", [("none", as_they_are), ("focus", "focus")])
 def test_spots_of_lenses_as_built_as_an_operand(singlet, compensator, given):
-    """Its merit is that of a Monte Carlo run, and so is its derivative."""
+    """Its merit and its derivative are those of a Monte Carlo run."""
     problem, some = singlet
     off = design.draw_perturbations(some, 7, 5)
     operand = design.Operand(design.spots_as_built(some, off, given, order=3))
@@ -227,7 +228,7 @@ def test_spots_of_lenses_as_built_as_an_operand(singlet, compensator, given):
     assert float(merit) == pytest.approx(traced(start), rel=1e-10)
     steps = 1e-5 * np.eye(len(start))
     wanted = [(traced(start + step) - traced(start - step)) / 2e-5 for step in steps]
-    # Refocused, the sensor of the design does not matter.
+    # With refocusing, the result does not depend on the sensor of the design.
     np.testing.assert_allclose(slopes, wanted, rtol=1e-5, atol=1e-8 * np.max(np.abs(wanted)))
 
 
@@ -255,7 +256,7 @@ def test_lenses_as_built_refuse_a_lens_of_other_surfaces(singlet):
 
 @pytest.mark.parametrize("word", ["gradient", "second derivatives", "", 2, None])
 def test_orders_that_are_unknown_are_refused(word):
-    """They silently gave the second one."""
+    """Before, they silently meant the second order."""
     whole = np.eye(2)
     some = design.Predicted(1.0, np.ones(2), 2 * whole, 6 * whole, np.zeros(1), np.zeros((2, 1)))
     off = np.array([[1.0, -1.0], [0.5, 0.5]])
@@ -313,7 +314,7 @@ def test_monte_carlo_depends_on_neither_threads_nor_tiles(singlet, monkeypatch):
 
 @pytest.mark.slow
 def test_lenses_that_pass_no_light_are_as_bad_as_can_be(singlet):
-    """Errors of any size: no NaN, and no good spot of the few rays that are left."""
+    """Errors of any size give no NaN, and no good spot from the few rays that are left."""
     off = 1e3 * design.draw_perturbations(singlet[1], 50, 0)
     found = design.monte_carlo(*singlet, off, "focus")
     assert not any(np.isnan(a).any() for a in found)

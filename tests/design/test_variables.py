@@ -21,7 +21,7 @@ surfaces:
   - {radius: 75.0, thickness: 3.0, nd: 1.62, vd: 60.0, phase: {coefficients: {2: 0.0, 4: 0.1}}}
   - {radius: -17.0, thickness: 38.0}
 """
-# Of each kind the numbers that its word means: (rows, terms).
+# The numbers that the name of each kind means: (rows, terms).
 ALL = {
     "curvature": ([0, 1, 2, 3, 5, 6], [0]),
     "conic": ([0, 1, 2, 3, 5, 6], [0]),
@@ -39,14 +39,14 @@ ALL = {
 
 @pytest.fixture
 def lens(tmp_path):
-    """Three lenses of model glasses, one asphere, all but two apertures open."""
+    """Three lenses of model glasses, with one asphere and all but two apertures open."""
     path = tmp_path / "model.yaml"
     path.write_text(MODEL)
     return load_lens(path)
 
 
 def changed(kind, lens, other):
-    """By how much numbers of a kind differ; inf from inf by 0."""
+    """Differences of the numbers of a kind; 0 for inf and inf."""
     after, before = (np.asarray(PARTS[kind].read(each)) for each in (lens, other))
     return np.where(after == before, 0, after) - np.where(after == before, 0, before)
 
@@ -71,7 +71,7 @@ def test_each_number_moves_alone_and_by_itself(lens, kind):
         change = changed(kind, moved, variables.lens)
         assert abs(change[place.row, place.term] - 0.1 * variables.scale[k]) < 1e-14
         change[place.row, place.term] = 0
-        if kind in ("index", "abbe"):  # of the media that go on behind
+        if kind in ("index", "abbe"):  # also of media that continue behind the next surface
             change[place.row + 1 :] = 0
         np.testing.assert_allclose(change, 0, atol=1e-14)
     others = set(PARTS) - {kind}
@@ -87,7 +87,7 @@ def test_from_vector_to_lens_and_back(lens):
     np.testing.assert_allclose(every.vector(every.lens_of(vector)), vector, rtol=1e-13, atol=1e-13)
     assert len(set(every.names)) == len(every.places)
 
-    # In one program, for many vectors, differentiable: each number of the lens by its own variable.
+    # In one program, for many vectors, differentiable: each number depends on its own variable.
     def back(vector):
         return every.vector(every.lens_of(vector))
 
@@ -115,7 +115,7 @@ def test_bounds_and_scales(lens):
     variables = Variables.from_lens(lens, vary)
     np.testing.assert_allclose(variables.low[:2], 0)
     np.testing.assert_allclose(variables.high[:2], 6)
-    # Indices end where glasses do, the others nowhere; the start lies within.
+    # Indices are bounded by those of glasses, other numbers are not; the start is inside.
     assert abs(variables.numbers(variables.low)[2] - 1.3) < 1e-12
     assert np.all(np.isinf(variables.low[3:])) and np.all(np.isinf(variables.high[3:]))
     assert variables.start[1] == 0 and variables.lens.curvature[1] == 0
@@ -123,10 +123,10 @@ def test_bounds_and_scales(lens):
 
 
 def test_scales_are_what_moves_the_light(lens):
-    """A step of any coefficient lifts its surface by the same at the beam's edge."""
+    """A step of any coefficient changes the sag at the edge of the beam by the same amount."""
     variables = Variables.from_lens(lens, [Vary("coefficients", (2,))])
     np.testing.assert_allclose(variables.scale, [0.04 / 4.0**4, 0.04 / 4.0**6], rtol=1e-12)
-    # And any of a phase turns light by as many waves there; bounds by waves at 3 mm.
+    # And a step of any phase term adds the same number of waves there; bounds are in waves at 3 mm.
     variables = Variables.from_lens(lens, ["phase"])
     np.testing.assert_allclose(variables.scale, [40 / 4.0**2, 40 / 4.0**4], rtol=1e-12)
     variables = Variables.from_lens(lens, [Vary("phase", sag=50.0, semi_diameter=3.0)])
@@ -136,7 +136,7 @@ def test_scales_are_what_moves_the_light(lens):
 
 @pytest.mark.parametrize("form", ["asphere", "zernike", "qbfs"])
 def test_coefficients_bounded_by_what_they_add_to_the_sag(form):
-    """Each at its bound moves the surface by 0.2 mm, at its highest, 3 mm from the axis."""
+    """Each coefficient at its bound changes the sag by at most 0.2 mm within 3 mm of the axis."""
     terms = {"asphere": {4: 0, 6: 0}, "qbfs": {0: 0, 2: 0}, "zernike": {4: 0, 7: 0}}[form]
     own = {"form": form, "coefficients": terms}
     own |= {} if form == "asphere" else {"norm_radius": 5.0}
@@ -182,7 +182,7 @@ def test_norm_radii_are_no_variables(tmp_path):
         "  - {radius: inf, thickness: 95, form: toroid, curvature_x: 0.001}\n"
     )
     names = Variables.from_lens(load_lens(path), ["coefficients"]).names
-    # Of the toroid its curvature in x and y^4; that of y^2 is its curvature.
+    # For the toroid the curvature in x and y^4; the term of y^2 is its curvature in y.
     assert names == (
         *("coefficients 0[1]", "coefficients 0[2]"),
         *("coefficients 1[0]", "coefficients 1[2]"),
@@ -204,7 +204,8 @@ def test_ties(lens):
 
 
 def test_scaled_and_shifted_ties(lens):
-    """A follower is scale x leader + shift, also of what does not vary, and moves by the scale."""
+    """A follower is scale x leader + shift, also for a leader that does not vary, and its
+    derivative has the factor scale."""
     ties = [Tie((0, 3), scale=-0.5), Tie((1, 6), "opposite", scale=2.0, shift=0.01)]
     ties.append(Tie((0, 5), kind="thickness", scale=0.25, shift=2.0))
     variables = Variables.from_lens(lens, ["curvature"], ties)
@@ -233,7 +234,7 @@ def test_ties_that_mean_nothing(given, said):
 
 
 def test_cemented_surfaces_have_one_shape(lens):
-    """Also where only some of the shape varies: what does not is made alike once."""
+    """Also if only a part of the shape varies: the rest is made equal once."""
     variables = Variables.from_lens(
         lens, ["curvature", Vary("conic", (2,))], [Tie((2, 3), "cemented")]
     )
@@ -352,7 +353,8 @@ def test_float32_stays(lens):
 
 
 def test_several_sets_of_one_lens_are_one_problem():
-    """In any sequence; what varies in two of them, or belongs to another lens, is refused."""
+    """In any sequence; a number that varies in two of them, or belongs to another lens, is
+    refused."""
     lens = load_lens("cooke_triplet")
     tie = Tie((0, 2), how="opposite")
     sets = (

@@ -1,4 +1,5 @@
-"""Operands of waves: closed forms of a perfect lens, analyses of the same lens, derivatives."""
+"""Operands of waves, compared with closed forms of a perfect lens and analyses of the same lens;
+and derivatives."""
 
 import dataclasses
 
@@ -28,14 +29,15 @@ ASKED = [
 
 
 def told(problem, lens):
-    """Values of all operands by name; rays are aimed, a third of the program of a search."""
+    """Values of all operands by name; rays are aimed without a search, which is a third of the
+    program."""
     rays = trace_fields(problem.with_solver(solve_aimed), lens)
     return {operand.name: operand.values(lens, rays) for operand in problem.operands}
 
 
 @pytest.mark.slow
 def test_a_perfect_lens_and_other_numbers_compile_nothing():
-    """A paraboloid: P10's transfer function of a circle and energy in Airy's rings."""
+    """A paraboloid has P10's transfer function of a circle and the energy in Airy's rings."""
     lens, program = load_lens(MIRROR), jax.jit(told)
     variables = Variables.from_lens(lens, ["sensor"])
     for part, wanted, zero, energy in zip(
@@ -56,7 +58,7 @@ def test_a_perfect_lens_and_other_numbers_compile_nothing():
 
 @pytest.fixture(scope="module")
 def triplet():
-    """A vector, and a program that tells values and derivatives there."""
+    """A vector, and a program that returns values and derivatives for it."""
     vary = [Vary("curvature", (0, 3)), Vary("thickness", (1,)), "sensor"]
     variables, rule = Variables.from_lens(COOKE, vary), Gauss(6, "bilateral")
     problem = Problem.from_variables(
@@ -75,14 +77,15 @@ def triplet():
 
 @pytest.mark.slow
 def test_derivatives_are_those_of_differences(triplet):
-    """Those of the energy to what the polynomials of its Bessel function leave, 1e-7."""
+    """Those of the energy agree within 1e-7, the error of the polynomials of its Bessel
+    function."""
     x, both = triplet
     assert_derivatives(lambda x: both(x)[1], both(x)[0], x, 1e-5, steps=(1e-3, 1e-4, 1e-5))
 
 
 @pytest.mark.slow
 def test_values_are_those_of_analyses(triplet):
-    """The rays of the design and those of the analyses are others; the cells are the same."""
+    """Design and analyses use different rays, but the same cells."""
     x, both = triplet
     found, rule = both(x)[1], Gauss(6, "bilateral")
     scene = COOKE, Scene.radians(FIELDS, np.inf, COLOURS, wavelength_weights=WEIGHTS)
@@ -98,7 +101,7 @@ def test_values_are_those_of_analyses(triplet):
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:size.* hold 99 %")
 def test_kernels_are_those_of_psf():
-    """An operand of one's own: the light beside the pixel in the middle, and its derivative."""
+    """A user's operand: the light outside of the middle pixel, and its derivative."""
     variables = Variables.from_lens(COOKE, ["sensor"])
     problem = Problem.from_variables(
         variables, ["spot"], Scene.radians(FIELDS, wavelengths=COLOURS), 6
@@ -159,7 +162,8 @@ def test_the_error_behind_the_filter_is_that_of_kernels_of_psf():
     "rule, within", [(Soft(6, "bilateral", 0.01), 4e-3), (Clipped(6, "bilateral"), 2e-4)]
 )
 def test_a_clipped_pupil(rule, within):
-    """Against the analyses with a finer rule; the light that fills the stop has other contrast."""
+    """Compared with analyses of a finer rule; the contrast for light that fills the stop is
+    different."""
     lens = dataclasses.replace(COOKE, semi_diameter=COOKE.semi_diameter.at[0].set(6.5))
     variables, field = Variables.from_lens(lens, ["sensor"]), jnp.array([0.0, 0.25])
     asked = [ASKED[0], ASKED[2]]
@@ -184,7 +188,7 @@ def test_a_clipped_pupil(rule, within):
 
 @pytest.mark.release
 def test_contrast_designs_a_lens_of_more_contrast():
-    """The triplet at 50 cycles/mm, from where least squares on spots ends."""
+    """The triplet at 50 cycles/mm, from the optimum of least squares on spots."""
     lens, waves = COOKE, (0.486, 0.588, 0.656)
     fields, rule = np.radians([0.0, 14.0, 20.0]), Gauss(5, "bilateral")
     variables = Variables.from_lens(

@@ -48,7 +48,7 @@ def test_a_wild_update_is_led_back_onto_the_limits(problem, hold, far):
 
 
 def test_it_slides_along_a_limit(problem):
-    # At the limit of the track, what pushes beyond it moves the rest of the lens all the same.
+    # At the limit of the track, a gradient towards longer tracks still moves the rest of the lens.
     track = design.Problem.from_variables(problem.variables, LIMITS[-1:])
     start = problem.variables.start
     push = jnp.asarray([name == "sensor" for name in problem.variables.names], start.dtype)

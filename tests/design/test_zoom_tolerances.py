@@ -1,4 +1,5 @@
-"""Tolerances of a zoom: beside lenses that are disturbed and refocused by hand in each position."""
+"""Tolerances of a zoom, compared with lenses that are changed and refocused by hand in each
+position."""
 
 import dataclasses
 import functools
@@ -41,7 +42,7 @@ WEIGHTS = np.array([0.5, 1.5]) / 2
 
 @functools.cache
 def zoom():
-    """The zoom, the problems of both positions and of all, and the lens with its errors."""
+    """The zoom, the problems of each position and of both, and the lens with its errors."""
     lenses = configured(load_lens(ZOOM), {"thickness 1": (10.0, 30.0), "sensor": (45.4, 41.5)})
     problems = [
         Problem.from_variables(
@@ -66,7 +67,7 @@ _traced = jax.jit(lambda problem, lens: design.as_built(problem, lens, "none").s
 
 
 def squares(number, error=(0, 0, 0, 0, 0), sensor=0.0, gap=0.0):
-    """Mean square of the spots of one position, disturbed by hand: the radius of surface 0 in per
+    """Mean square of the spots of one position, changed by hand: the radius of surface 0 in per
     cent, the gap of each position, the shift along x and y of the second lens, mm."""
     problems, _, some = zoom()
     lens = some.lenses[number]
@@ -81,14 +82,14 @@ def squares(number, error=(0, 0, 0, 0, 0), sensor=0.0, gap=0.0):
 
 
 def focused(error):
-    """Each position at its own best focus: squares and where the sensor is."""
+    """Each position at its own best focus: squares and positions of the sensor."""
     spots = [lambda m, k=k: 1e3 * squares(k, error, m) for k in (0, 1)]
     found = [optimize.minimize_scalar(spot, bracket=(-0.5, 0.5), tol=1e-8) for spot in spots]
     return np.array([one.fun for one in found]) / 1e3, [one.x for one in found]
 
 
 def focused_once(error):
-    """Both positions at one best focus."""
+    """Both positions with one common best focus."""
     mean = lambda m: 1e3 * sum(w * squares(k, error, m) for k, w in enumerate(WEIGHTS))  # noqa: E731
     found = optimize.minimize_scalar(mean, bracket=(-0.5, 0.5), tol=1e-8)
     return np.array([squares(k, error, found.x) for k in (0, 1)]), [found.x]
@@ -111,7 +112,7 @@ def test_errors_are_common_or_of_one_configuration():
     np.testing.assert_allclose([one.thickness[1], two.thickness[1]], [10.1, 29.8])
     np.testing.assert_allclose([one.curvature[0], two.curvature[0]], 1 / 60.6)
     np.testing.assert_array_equal(one.elements.shift, two.elements.shift)
-    # One configuration alone makes no difference between them.
+    # With one configuration, shared and separate errors are the same.
     alone = PerturbedLens.from_lens(some.lens, some.beam_radius, ERRORS)
     assert str(alone.deviations[1]) == "thickness of surface 1"
 
@@ -145,7 +146,7 @@ def test_each_row_is_the_zoom_disturbed_by_hand(compensator, by_hand):
         "common focus": ["sensor (mm)"],
     }
     assert rows[0][8:] == names[compensator] and len(rows) == 6
-    # What one position has of its own does nothing to the other, if that has its own focus.
+    # An error of one position alone does not change another position that has its own focus.
     if compensator == "focus":
         np.testing.assert_allclose(table.each[1, :, 1], 0, atol=1e-15)
         assert abs(table.each[1, 0, 0]) > 1e-5
@@ -153,7 +154,7 @@ def test_each_row_is_the_zoom_disturbed_by_hand(compensator, by_hand):
 
 @pytest.mark.slow
 def test_shared_and_own_adjustments_are_where_a_search_ends():
-    """The sensor once for both, the gap in each position, within limits."""
+    """One sensor position for both, and a gap for each position, within limits."""
     _, both, some = zoom()
     kinds = [Tolerance("sensor", 2.0), Tolerance("thickness", 0.15, (1,), own=True)]
     off = np.array([[0.9, 0.2, -0.4, 0.1, -0.3], [-0.5, -1.0, 0.2, 0.6, 0.5]])
@@ -169,7 +170,7 @@ def test_shared_and_own_adjustments_are_where_a_search_ends():
         assert best.fun * (1 - 1e-4) < value < best.fun * (1 + 1e-5)
         np.testing.assert_allclose(found.moves[k], best.x, atol=5e-3)
         free += np.sum(np.abs(found.moves[k, 1:]) < 0.149)
-    assert free < 4  # some stay at their limits
+    assert free < 4  # the others are at their limits
     np.testing.assert_allclose(found.value, np.sqrt(found.each**2 @ WEIGHTS), rtol=1e-12)
 
 
@@ -191,7 +192,7 @@ def test_second_derivatives_are_those_of_lenses():
 
 @pytest.mark.slow
 def test_all_positions_have_to_be_good():
-    """Lenses one after the other beside all together; a criterion that is no mean square."""
+    """Lenses one by one compared with all together; and a criterion that is not a mean square."""
     problems, both, some = zoom()
     draws = design.draw_perturbations(some, 6, seed=0)
     sharp = Assembly("focus", Operand("mtf", target=1, at=20.0))

@@ -1,4 +1,5 @@
-"""An experiment that trains in milliseconds, for tests of all that is around one.
+"""An experiment that trains in milliseconds, for tests of the command line, run folders and
+interruptions.
 
 `python -m tests.experiments.counting` runs it like those of `experiments`.
 """
@@ -14,14 +15,14 @@ from experiments import _command
 from experiments.runs.interrupt import deferred_interrupt
 
 COLUMNS = ("loss",)
-# What writes, or makes others wait: the moments at which to die.
+# Functions that write or lock: the moments at which a process is killed.
 _WRITES = ("open", "ftruncate", "fsync", "replace", "mkdir", "unlink")
 
 
 @dataclasses.dataclass(frozen=True)
 class Config:
-    """jobs: their names. batches: steps of each. result: of the run. pressed: at this step of each
-    job the process sends itself this signal."""
+    """jobs: names of the jobs. batches: number of steps of each. result: result of the run.
+    pressed: step of each job at which the process sends itself this signal."""
 
     jobs: tuple[str, ...] = ("one", "two")
     batches: int = 5
@@ -30,7 +31,7 @@ class Config:
 
 
 def run(config, run):
-    """Steps of which each needs the one before, with a checkpoint after every second."""
+    """Steps of which each needs the one before, with a checkpoint after every second step."""
     found = {job: float(train(config, run, job)) for job in config.jobs}
     if run.kept("last") is None:
         run.keep("last", {"nan": config.result})
@@ -55,17 +56,17 @@ def train(config, run, job):
 
 
 def tables(results):
-    """What was found."""
+    """A table of the results."""
     return {"counting": f"found {results['found']}, {results['nan']}"}
 
 
 def draw(results, figures):
-    """A picture in words."""
+    """A text file as figure."""
     (figures / "found.txt").write_text(str(results["found"]))
 
 
 def at_each_write(act):
-    """Call act(k) before and after whatever writes; k counts these moments."""
+    """Calls act(k) before and after each function that writes or locks; k counts these moments."""
     count = iter(range(10**6))
 
     def watched(call):
@@ -82,8 +83,8 @@ def at_each_write(act):
 
 
 def killed_everywhere(parent, config):
-    """For every third such moment: a run that ends there without a word, and what a second one
-    makes of its folder, in processes that share what is imported. Prints how many moments."""
+    """For every third of these moments: a run that is killed there, and a second run that continues
+    in its folder, in processes that share the imports. Prints the number of moments."""
 
     def start(moment, *options):
         child = os.fork()

@@ -1,4 +1,4 @@
-"""The promised tolerance, the reference integral, the experiment."""
+"""Tolerances of spots, the reference integral, and the experiment."""
 
 import dataclasses
 import functools
@@ -25,7 +25,8 @@ def spot_size(covariance):
 
 @functools.cache
 def focused(name, distance, defocus=0.0):
-    """The lens with its sensor `defocus` mm behind the best focus of the mean colour on axis."""
+    """The lens with its sensor `defocus` mm behind the best axial focus of the mean over the
+    wavelengths."""
     lens = load_lens(name)
     spread = drt_jax.focus_moments(lens, Scene.point(0.0, distance, RGB), 1e-9).spread
     _, linear, square = np.sum(np.asarray(spread), axis=(1, 2))
@@ -34,7 +35,8 @@ def focused(name, distance, defocus=0.0):
 
 
 def assert_kept(lens, field, distance, size, tolerances):
-    """Every tolerance is kept: errors of the spot size, the worst colour, relative."""
+    """Asserts that every tolerance is kept: relative errors of the spot size for the worst
+    wavelength."""
     for tolerance in tolerances:
         got = spot_size(psf_moments(lens, Scene.point(field, distance, RGB), tolerance).covariance)
         error = float(np.max(np.abs(got / size - 1)))
@@ -50,7 +52,7 @@ def assert_kept(lens, field, distance, size, tolerances):
     "name", ["double_gauss", pytest.param("cooke_triplet", marks=pytest.mark.slow)]
 )
 def test_spot_size_keeps_its_tolerance(name, degrees, distance):
-    """In focus and 1 mm out, against orders whose own error is rounding."""
+    """In focus and 1 mm out of focus, compared with orders whose own error is rounding."""
     field = np.radians(degrees)
     for defocus in (0.0, 1.0):
         lens = focused(name, distance, defocus)
@@ -95,7 +97,7 @@ def test_vignetted_spot_size_keeps_its_tolerance(degrees, distance, front, rear)
     assert_kept(lens, field, distance, truth(lens, field, distance), TOLERANCES)
 
 
-# A ring of 3 mm before a stop of 4 mm on the only surface, of 60 mm focal length in the glass.
+# A ring of 3 mm in front of a stop of 4 mm on the only surface; its focal length in glass is 60 mm.
 CLIPPED = {
     "surfaces": [
         {"radius": "inf", "thickness": 20.0, "semi_diameter": 3.0},
@@ -107,8 +109,8 @@ CLIPPED = {
 
 @pytest.mark.slow
 def test_reference_of_a_clipped_beam():
-    """On axis the ring alone limits a parallel beam, so that it may as well be the stop; off
-    axis the two circles overlap, and a million points of a grid sum to the same."""
+    """On axis only the ring limits a parallel beam, so that it could be the stop. Off axis the two
+    circles overlap; a sum over a million points of a grid gives the same result."""
     lens = load_lens(CLIPPED)
     alone = dataclasses.replace(lens, semi_diameter=jnp.array([np.inf, 3.0, np.inf]))
     clipped, round_ = (reference(a, 0.0, math.inf, [0.55]) for a in (lens, alone))
@@ -122,7 +124,7 @@ def test_reference_of_a_clipped_beam():
     good = np.asarray(rays.status[0]) == drt_jax.Status.OK
     assert 0.3 < np.mean(good) < 0.6
     spot = np.asarray(rays.points[0, good, -1, :2])
-    # The grid sees the edge to a cell, 1/200 of the radius, and its errors there cancel.
+    # The grid resolves the edge to a cell, 1/200 of the radius, and its errors at the edge cancel.
     np.testing.assert_allclose(np.sqrt(np.sum(np.var(spot, axis=0))), tilted.sigma[0], rtol=1e-3)
     np.testing.assert_allclose(np.mean(spot[:, 1]), tilted.centroid[0], atol=1e-3 * tilted.sigma[0])
 
@@ -174,7 +176,7 @@ def test_small_run_of_the_experiment(small_run):
     # Values and gradients of the library converge to those of the sequential trace ...
     assert rows[1]["relative_error"] < 1e-12 and rows[1]["gradient_error"] < 1e-8
     assert rows[1]["centroid_error"] < 1e-12 and rows[1]["centroid_gradient_error"] < 1e-8
-    # ... and 6 rays of a rule come nearer than 256 of any pattern.
+    # ... and 6 rays of a rule have a smaller error than 256 of any pattern.
     assert rows[0]["relative_error"] < min(row["relative_error"] for row in rows[2:])
     for promise in results["tolerances"]:
         assert promise["relative_error"] <= promise["tolerance"]

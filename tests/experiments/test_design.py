@@ -1,4 +1,4 @@
-"""experiments.design at toy size: what it writes, that it resumes, how it refuses."""
+"""experiments.design at toy size: what it writes, how it resumes, its errors."""
 
 import json
 import pathlib
@@ -38,7 +38,7 @@ def test_a_lens_is_designed_from_several_starts(tmp_path, monkeypatch, capsys):
     np.testing.assert_allclose(spot, row["spots_um"][0], rtol=1e-9)
     figures = {path.stem for path in (tmp_path / "run" / "figures").glob("*.png")}
     assert figures == {"lens", "spots", "merit", "minima", "minima_drawn"}
-    # What is finished is not searched for again.
+    # A finished job is not searched for again.
     (tmp_path / "run" / "results.json").unlink()
     monkeypatch.setattr(design.design, "many_starts", None)
     monkeypatch.setattr(design.design, "optimise", None)
@@ -49,8 +49,8 @@ def test_a_lens_is_designed_from_several_starts(tmp_path, monkeypatch, capsys):
 
 @pytest.mark.slow
 def test_a_lens_grows_with_its_aperture(tmp_path, monkeypatch, capsys):
-    """Half of the beam first, then more, each until it is good; a run that is stopped goes on where
-    it was; or it says how far it came."""
+    """First half of the beam, then more, each until it is good enough; a run that is stopped
+    continues from its checkpoint; if growth stops, the error names the part that was reached."""
     monkeypatch.chdir(ROOT)
     growth = ["growth.first=0.5", "growth.step=0.3", "growth.trials=20", "tolerance=0.1"]
     searched = []
@@ -98,8 +98,8 @@ def test_a_lens_grows_with_its_aperture(tmp_path, monkeypatch, capsys):
 
 @pytest.mark.release
 def test_a_phone_lens_from_a_crude_start(tmp_path, monkeypatch):
-    """Five aspheres, f/2 and 35 degrees: below 3 um on all fields, all limits kept. Of one colour
-    and four fields, which takes a quarter of the time; results/design/phone has all."""
+    """Five aspheres, f/2 and 35 degrees: spots below 3 um at all fields, within all limits. One
+    wavelength and four fields take a quarter of the time; results/design/phone has all."""
     monkeypatch.chdir(ROOT)
     fewer = ["fields_deg=[0,14,28,35]", "wavelengths_um=[0.5876]", "order=4"]
     main("phone", tmp_path / "run", *fewer, "trials=120", "tolerance=1e-3")
@@ -119,7 +119,7 @@ def test_starts_load(path):
 
 @pytest.mark.slow
 def test_glasses_become_real(tmp_path, monkeypatch):
-    """The lens that is written has them, and the merit that is told; none stays a model."""
+    """The lens that is written has real glasses and the reported merit, and no model glass."""
     monkeypatch.chdir(ROOT)
     few = ["glasses.count=3", "glasses.steps=3", "trials=15", "tolerance=0.1", "order=3"]
     main("apochromat", tmp_path / "run", *few)

@@ -1,5 +1,5 @@
 """Runs that end early: Ctrl-C, kill -9 and full disks at every moment, ignored signals, results
-that are not finite. What is left is nothing, or a run that goes on to the same numbers."""
+that are not finite. The folder is then empty, or has a run that resumes to the same numbers."""
 
 import importlib
 import json
@@ -39,7 +39,7 @@ def begin(folder, *options):
 
 
 def left(folder):
-    """What a run leaves, without its seconds and its machine, whose load changes."""
+    """The files of a run, without its seconds and its machine, whose load changes."""
     results = json.loads((folder / "results.json").read_text(), parse_constant=pytest.fail)
     results.pop("seconds"), results.pop("machines")
     with np.load(folder / "results.npz") as arrays:
@@ -57,7 +57,7 @@ def unbroken(tmp_path_factory):
 
 
 def go_on(folder, said):
-    """Do what the last line says."""
+    """Runs the command that the last line names."""
     if "nothing was begun" in said:
         return begin(folder)
     option = re.search(f"(--resume|--report) --out {re.escape(str(folder))}", said)[1]
@@ -65,7 +65,8 @@ def go_on(folder, said):
 
 
 def pressing(monkeypatch, moments):
-    """Ctrl-C at some moments, see `counting`; a function that says how many there were."""
+    """Sends Ctrl-C at some moments, see `counting`; returns a function that returns the number of
+    moments."""
     seen = []
 
     def act(moment):
@@ -105,7 +106,7 @@ def test_ctrl_c_at_any_moment_says_what_it_leaves(again, unbroken, tmp_path, mon
 
 @pytest.mark.slow
 def test_kill_at_any_moment(unbroken, tmp_path):
-    """No handler runs: the file that is being written stays half there, the lock is gone."""
+    """No handler runs: the file that is being written is incomplete, the lock is removed."""
     command = [sys.executable, "-m", "tests.experiments.counting", "killed", tmp_path, CONFIG]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=200)
     assert done.returncode == 0, done.stderr
@@ -115,7 +116,7 @@ def test_kill_at_any_moment(unbroken, tmp_path):
 
 
 def test_a_disk_that_is_full_at_any_size_costs_nothing(unbroken, tmp_path, capsys):
-    """Files may not grow beyond a limit, which is one byte, or a few, more in each turn."""
+    """Files cannot grow beyond a limit, which is one byte, or a few, larger in each turn."""
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
     codes = set()
     for size in (0, 5, 13, 20, 40, 60, 100, 140, 300, 900, 1200, 1500, 5000):
@@ -151,7 +152,7 @@ def test_names_with_spaces_and_other_signs(unbroken, tmp_path):
 @pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_in_training_is_heard_or_stays_ignored(number, unbroken, tmp_path):
-    """As a shell starts a program in the background of a script, or under `nohup`."""
+    """As when a shell starts a program in the background of a script, or with `nohup`."""
     pressed = ["--set", f"pressed={int(number)}"]
     command = [sys.executable, "-m", "tests.experiments.counting", "--config", CONFIG, *pressed]
     for ignored, code in (("''", 0), ("-", 130)):
@@ -179,7 +180,7 @@ raise SystemExit(7)
 
 @pytest.mark.parametrize("name", ["focus", "restore", "edof", "benchmark", "tables"])
 def test_ctrl_c_while_importing(name, tmp_path):
-    """Pressed in the first import of JAX: one line, unless it is ignored."""
+    """Sent during the first import of JAX: one line of output, unless it is ignored."""
     (tmp_path / "jax").mkdir()
     (tmp_path / "jax" / "__init__.py").write_text(EARLY)
     command = [sys.executable, "-m", f"experiments.{name}", "--out", str(tmp_path / "run")]
@@ -224,7 +225,8 @@ def test_a_live_run_keeps_others_out(tmp_path, capsys):
 
 
 def test_results_that_are_not_finite_are_said(tmp_path, capsys):
-    """null in the file, named on the terminal, an exit code: again where they are reported."""
+    """They are null in the file, are named on the terminal, and give an exit code; also when they
+    are reported again."""
     folder = tmp_path / "run"
     assert begin(folder, "--set", "result=.inf") == 1
     said = capsys.readouterr()
@@ -312,6 +314,6 @@ def test_a_loss_that_is_not_finite_ends_the_training():
     "path", sorted(ROOT.glob("results/*/results.json")), ids=lambda path: path.parent.name
 )
 def test_results_kept_with_the_code_are_json(path):
-    constants: list[str] = []  # NaN, Infinity: what JSON knows none of
+    constants: list[str] = []  # NaN and Infinity, which JSON does not have
     found = json.loads(path.read_text(), parse_constant=constants.append)
     assert found and not constants

@@ -1,5 +1,5 @@
-"""The paper's experiments at toy size: what they write, that they resume, how they fail; and the
-settings and tables of all."""
+"""The paper's experiments at toy size: what they write, how they resume, their errors; and the
+settings and tables of all experiments."""
 
 import importlib
 import json
@@ -69,7 +69,8 @@ def toy(name, folder):
 
 
 def stop(name, folder, settings, *moment):
-    """Ctrl-C at a moment of a run: a job, and the first step of the metrics that it has logged."""
+    """Sends Ctrl-C at a moment of a run: a job, and the first step of the metrics that it has
+    logged."""
     log = Run.log
 
     def interrupting(self, job, step, rows):
@@ -85,7 +86,7 @@ def stop(name, folder, settings, *moment):
 
 @pytest.fixture(scope="module")
 def unbroken(tmp_path_factory):
-    """The run folder of each experiment, run once without a break."""
+    """The run folder of each experiment, run once without interruption."""
     folders = {}
 
     def run(name):
@@ -132,7 +133,8 @@ def test_a_run_explains_itself(name, unbroken):
 
 @pytest.mark.parametrize("name", ["focus", pytest.param("restore", marks=pytest.mark.slow)])
 def test_an_interrupted_run_resumes_to_the_same_numbers(name, unbroken, tmp_path, capsys):
-    """Ctrl-C in the middle of a job, then --resume: metrics and results of an unbroken run."""
+    """Ctrl-C in the middle of a job, then --resume: metrics and results are those of an
+    uninterrupted run."""
     stop(name, tmp_path / "run", TOY[name], "start 134.0", 10)
     assert "--resume" in capsys.readouterr().err
     main(name, "--resume", "--out", tmp_path / "run")
@@ -149,7 +151,7 @@ def assert_same(wanted, folder):
 
 
 def test_a_killed_run_resumes_to_the_same_numbers(unbroken, tmp_path):
-    """kill -9 once metrics have come: nothing is lost but the steps since the checkpoint."""
+    """kill -9 after the first metrics: only the steps since the checkpoint are lost."""
     folder = tmp_path / "run"
     command = [
         sys.executable,
@@ -199,7 +201,7 @@ def test_of_many_skipped_files_a_few_are_named_and_all_are_listed(tmp_path, caps
 
 @pytest.mark.parametrize("name", NAMES)
 def test_pictures_are_drawn_again_without_the_run(name, unbroken, tmp_path, monkeypatch, capsys):
-    """From the results alone: the same pictures to the last byte, and the same tables."""
+    """From the results alone: the same figures to the last byte, and the same tables."""
     folder = tmp_path / "copy"
     folder.mkdir()
     for path in unbroken(name).glob("results.*"):
@@ -212,7 +214,7 @@ def test_pictures_are_drawn_again_without_the_run(name, unbroken, tmp_path, monk
 
 
 def test_tables_of_the_pages_are_those_of_the_results():
-    """`python -m experiments.tables` has nothing to write."""
+    """`python -m experiments.tables` would change nothing."""
     found, used = tables.all_tables(), []
     for page in tables.pages():
         text = page.read_text()
@@ -224,7 +226,7 @@ def test_tables_of_the_pages_are_those_of_the_results():
 
 
 def test_every_row_of_evidence_is_made_by_a_command():
-    """No table there is written by hand."""
+    """No table of this page is written by hand."""
     text = (_common.ROOT / "docs" / "evidence.md").read_text()
     left = tables._BLOCK.sub("", text)
     assert "<!-- table: benchmark, curves -->" in text
@@ -249,7 +251,7 @@ def test_a_table_can_be_read_as_text():
 
 @pytest.mark.slow
 def test_interrupt_in_the_last_steps_of_a_job_stops_before_the_next(tmp_path):
-    """In the last of its reports, of steps 0, 10 and 20 to 24."""
+    """In the last report of the job; reports are at steps 0, 10 and 20 to 24."""
     stop("restore", tmp_path / "run", TOY["restore"], "start 133.0", 20)
     lines = (tmp_path / "run" / "metrics.csv").read_text().splitlines()[1:]
     assert {line.split(",")[0] for line in lines} == {"start 133.0"}

@@ -32,7 +32,7 @@ def test_what_is_no_experiment_goes_to_the_package(monkeypatch, capsys):
 
 @pytest.mark.slow
 def test_a_wheel_runs_an_experiment_with_its_default_settings(tmp_path):
-    """In a folder that is no checkout; the settings name a lens beside them."""
+    """In a folder that is not a checkout; the settings name a lens file next to them."""
     source = tmp_path / "source"
     subprocess.run(["git", "clone", "-q", ROOT, source], check=True)
     for path in subprocess.run(

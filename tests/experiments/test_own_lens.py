@@ -1,5 +1,5 @@
-"""The paper's experiments with a lens of one's own: fields, variables, their rates, what is shown
-of them, and how a lens that goes bad ends a run."""
+"""The paper's experiments with a user's lens: fields, variables, their rates, what is drawn, and
+how a run ends when surfaces cross."""
 
 import functools
 import json
@@ -46,7 +46,7 @@ def read(folder):
 
 @pytest.fixture(scope="module")
 def own(tmp_path_factory):
-    """A run of `restore` with a lens, a field and variables of one's own."""
+    """A run of `restore` with a user's lens, field and variables."""
     folder = tmp_path_factory.mktemp("own") / "run"
     main("restore", "--out", folder, "--set", *RESTORE)
     return folder
@@ -64,7 +64,7 @@ def test_a_lens_is_trained_off_the_axis(own):
         assert start[name] != end[name]
     assert rows["sensor_mm"][0] == start["sensor"] == 60.1 != end["sensor"]
     assert end["rms_um"] < 0.5 * start["rms_um"] and end["light"] == pytest.approx(1)
-    # The lens in the folder is the one that was told, and its blur the one that was trained with.
+    # The lens in the folder is the reported one, and its blur is that of the training.
     designed = drt_jax.load_lens(own / "designed" / "start 60.1.yaml")
     assert designed.curvature.tolist() == [*(end[name] for name in NAMES), 0.0]
     assert float(designed.sensor) == end["sensor"]
@@ -98,8 +98,8 @@ def test_an_interrupted_run_resumes_to_the_same_lens(own, tmp_path):
 
 @pytest.mark.slow
 def test_focus_without_its_sensor_and_how_a_lens_goes_bad(tmp_path, capsys):
-    """A sensor that is no variable stays; and surfaces that cross end a run, with the lens from
-    before and all metrics in its folder."""
+    """A sensor that is not a variable does not move. Surfaces that cross end a run; its folder then
+    has the last valid lens and all metrics."""
     main("focus", "--out", tmp_path / "good", "--set", *FOCUS, "train.optics_rate=0.01")
     results, said = read(tmp_path / "good"), capsys.readouterr().out
     assert results["final_mm"] == pytest.approx([60.1, 60.3]) and "best_focus_mm" not in results
@@ -121,7 +121,7 @@ def test_focus_without_its_sensor_and_how_a_lens_goes_bad(tmp_path, capsys):
 
 @pytest.mark.slow
 def test_edof_with_a_field_beside_the_planes_of_the_lens(tmp_path, capsys):
-    """A dense kernel, and numbers of single surfaces."""
+    """With a dense kernel, and variables of single surfaces."""
     some = ["train.variables=[sensor, curvature 0, thickness 1]", "depth_m=[2, 10]"]
     some += ["starts_mm=[60.1, 60.5]", "fixed_mm=60.5", "scene.field=[5, 8]", "test_patches=3"]
     some += ["table_depth_m=[1.5, 5]", "patch_depth_m=[2, 5]", "train.optics_rate=0.01"]
@@ -131,7 +131,7 @@ def test_edof_with_a_field_beside_the_planes_of_the_lens(tmp_path, capsys):
     assert {"sensor", "curvature 0", "thickness 1"} < set(results["numbers"][1][1])
     with np.load(tmp_path / "run" / "results.npz") as arrays:
         assert arrays["blur_um"].shape == (2, 121, 3) and arrays["changes_mm"].shape == (2, 2, 25)
-        # The second is of the lens that was trained: less blur over the depths of its training.
+        # The second is for the trained lens, which has less blur over the depths of its training.
         assert arrays["blur_um"][1].mean() < arrays["blur_um"][0].mean()
 
 
@@ -145,7 +145,7 @@ def test_the_sensor_alone_traces_no_ray_off_the_axis_either():
 
 @functools.cache
 def joint():
-    """The loss of the joint training by the numbers of the lens, and the numbers."""
+    """The loss of the joint training as a function of the numbers of the lens, and the numbers."""
     some = lens("sensor", "curvature")
     init, restore = learn.red_net(2, 4)
     weights = init(jax.random.key(0))
@@ -163,8 +163,8 @@ def joint():
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["curvature 0", "curvature 3"])
 def test_gradient_of_the_joint_loss_by_a_curvature(name):
-    """Against central differences whose step is swept: images are float32, so that it is neither
-    to be small nor large."""
+    """Compared with central differences of varied steps. Images are float32, so that the step must
+    not be too small."""
     both, values = joint()
     slope = both(values)[1][name]
     errors = []
@@ -177,7 +177,8 @@ def test_gradient_of_the_joint_loss_by_a_curvature(name):
 
 @pytest.mark.slow
 def test_a_change_of_the_scale_moves_the_rays_as_a_millimetre_of_the_sensor_does():
-    """Against differences of rays; a conic that would have to change by thousands does not."""
+    """Compared with differences of rays, except for a conic that would have to change by
+    thousands."""
     some = lens("sensor", "curvature", "thickness 1", "conic 1")
     scale, pupil = some.scale(SCENE, FAR), hexapolar(4)[0]
     start = some.start(float(some.lens.sensor))

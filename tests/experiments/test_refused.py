@@ -1,5 +1,4 @@
-"""Settings that cannot be used: one short line names the key and says what is expected, and nothing
-is begun."""
+"""Invalid settings: one short line names the key and the expected value, and no run starts."""
 
 import numpy as np
 import pytest
@@ -9,7 +8,7 @@ from .test_experiments import ROOT, main
 from .test_starts import STARTS
 from .test_tolerance import SETTINGS
 
-# Settings that are right, by experiment.
+# Valid settings, by experiment.
 RIGHT = {
     "accuracy": [],
     "design": [],
@@ -18,7 +17,7 @@ RIGHT = {
     "tolerance": [f"{key}={value}" for key, value in SETTINGS.items()],
     "joint": [k for k in STARTS["joint"] if not k.startswith(("arms", "tolerances", "judge"))],
 }
-# Those that are not, and parts of the line.
+# Invalid settings, and parts of the line.
 WRONG = {
     "accuracy": [
         ("orders=[2, 41]", "orders: expected 1 to 40"),
@@ -115,7 +114,7 @@ CASES = [
 
 
 def refused(capsys, name, *options):
-    """The line with which an experiment ends."""
+    """The last line of output of an experiment."""
     with pytest.raises(SystemExit) as stopped:
         main(name, *options)
     error = capsys.readouterr().err

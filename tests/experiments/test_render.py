@@ -1,4 +1,4 @@
-"""experiments.render at toy size: its pictures, its words, and bad photographs."""
+"""experiments.render at toy size: its figures, its messages, and invalid photographs."""
 
 import json
 
@@ -29,7 +29,7 @@ def photo(tmp_path):
 
 
 def test_a_zoom_takes_its_photograph_in_any_configuration():
-    """The focal lengths are those of the patent; a configuration that is not there is named."""
+    """The focal lengths are those of the patent; the error for a missing configuration names it."""
     zoom, key = "configs/design/lenses/us5568323.zmx", "scene.configuration"
     words = f"scene.lens={ROOT / zoom}"
     for number, focal in ((1, 28.98), (2, 49.99), (3, 68.0)):

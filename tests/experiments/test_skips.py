@@ -1,4 +1,4 @@
-"""Both ways of every skip come to the truth, so to the same answer."""
+"""Both ways of every skip agree with the reference, and therefore with each other."""
 
 import functools
 
@@ -7,9 +7,9 @@ import pytest
 
 from experiments import _skips, skips
 
-# Not tested here, because they compile for long: new processes and kernels.
+# Not tested here, because they take long to compile: new processes and kernels.
 UNTESTED = "kept", "polynomials", "kernels"
-# Largest error of each way, with the skip and without; of random rays, by chance.
+# Largest error of each way, with the skip and without it; that of random rays is statistical.
 BOUNDS = {name: (1e-6, 1e-6) for name in skips.SKIPS} | {
     "quadrature": (1e-6, 0.2),
     "separable": (1e-5, 1e-5),

@@ -1,4 +1,4 @@
-"""The sequential trace that everything is compared with, against closed forms."""
+"""The sequential trace, which is the reference of all comparisons, compared with closed forms."""
 
 import dataclasses
 
@@ -17,8 +17,8 @@ HEIGHTS = jnp.array([[0.0, 0.0, -5.0], [0.0, 1.5, -5.0], [1.0, -0.5, -5.0]])
 
 
 def test_paraboloid_and_ellipsoid_are_stigmatic():
-    """Parallel light meets the focus of a paraboloid, and that of an ellipsoid of glass with
-    k = -1/n^2, n R / (n - 1) behind its vertex."""
+    """Parallel rays meet in the focus of a paraboloid, and in that of an ellipsoid of glass with k
+    = -1/n^2, n R / (n - 1) behind its vertex."""
     mirror = {"radius": -40.0, "conic": -1.0, "mirror": True, "stop": True, "semi_diameter": 5.0}
     glass = {"radius": 20.0, "conic": -1 / 2.25, "index": 1.5, "stop": True, "semi_diameter": 5.0}
     for surface, focus in ((mirror, -20.0), (glass, 60.0)):
@@ -29,7 +29,7 @@ def test_paraboloid_and_ellipsoid_are_stigmatic():
 
 
 def test_a_surface_that_bends_no_light_is_on_the_line_and_changes_nothing():
-    """A stop plane before, at and behind the first vertex; tilted light."""
+    """A stop plane in front of, at and behind the first vertex, with oblique rays."""
     direction = jnp.array([0.1, 0.3, 1.0]) / jnp.sqrt(1.1)
     found = []
     for gap in (0.6, 0.0, -0.4):
@@ -61,8 +61,8 @@ def test_light_does_not_go_backwards_between_surfaces_that_bend_it():
 
 
 def test_an_asphere_whose_conic_is_missed():
-    """A paraboloid that a term in r^2 makes flatter is a flatter one: a slanted ray meets it, and
-    misses the steep one."""
+    """A paraboloid with a term in r^2 that makes it flatter is the flatter paraboloid. An oblique
+    ray meets it, but misses the steep one."""
     plane = {"radius": "inf", "thickness": 1.0, "stop": True, "semi_diameter": 3.0}
     steep = {"radius": 1 / 0.15, "conic": -1.0, "index": 1.5}
     flat = steep | {"radius": 1 / 0.03}
@@ -89,9 +89,10 @@ sources = jax.jit(jax.vmap(jax.vmap(_point_source, (None, None, 0))))
 
 def test_conics_far_off_axis_image_their_foci():
     """The families "turned" and "foci" of `experiments.stability`, mirrors that turn the beam by 30
-    to 150 degrees: the chief ray meets the middle of the sensor, and so do all rays where it stands
-    at a focus. From its focus a paraboloid is met at R / (1 - cosine), R its vertex radius and the
-    cosine that of the ray with the direction in which all rays leave."""
+    to 150 degrees. The chief ray meets the middle of the sensor, and all rays do if the sensor is
+    at a focus. A ray from the focus of a paraboloid has the length R / (1 - cosine), where R is the
+    vertex radius and cosine that of the angle between the ray and the direction in which all rays
+    leave."""
     for name in ("turned", "foci"):
         for scenes in draw(name, 300, 5, ((1, False), (2, False))):
             hits, ok = (np.asarray(a) for a in sources(scenes.lens, scenes.distance, scenes.pupil))

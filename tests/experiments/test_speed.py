@@ -1,4 +1,4 @@
-"""What experiments on speed measure with. `test_starts` runs them."""
+"""Tools of the experiments on speed. `test_starts` runs the experiments."""
 
 import dataclasses
 from functools import partial
@@ -77,14 +77,14 @@ def test_an_attempt_has_calls_by_tolerance_or_a_reason():
     assert row["error"] == 1e-7 and row["why"] == ""
     calls, row = _profile.attempt([fails()])
     assert not any(calls) and row["why"] == "AttributeError: no such surface"
-    calls, row = _profile.attempt([fails(1e-4)])  # what it had found counts
+    calls, row = _profile.attempt([fails(1e-4)])  # the results before the failure count
     assert [len(some) for some in calls] == [1, 0, 0] and row["why"] == ""
     assert _profile.attempt([tried(np.nan)])[1]["why"] == "the spot is not finite"
     assert _profile.attempt([tried(1e-2)])[1]["why"] == "no sampling comes to 1e-03"
 
 
 def test_a_profile_counts_scenes_and_compares_with_the_fastest():
-    """Two scenes; the reference of the second does not know the ninth digit."""
+    """Two scenes; the reference of the second is not accurate to nine digits."""
 
     def row(program, field, error, *seconds):
         times = [None if s is None else [s, s, s] for s in seconds]
@@ -120,8 +120,9 @@ def test_files_of_a_profile_are_those_of_the_folder_and_none_is_needed(tmp_path)
 
 @pytest.mark.slow
 def test_our_nodes_through_another_tracer_come_to_the_reference(monkeypatch):
-    """Rays that we aimed, traced by Snell's law: the weights, the symmetry and the launch fit; and
-    central differences of its lenses, each aimed at anew, are derivatives at fixed stop points."""
+    """Rays that we aim, traced by Snell's law: weights, symmetry and launch agree. Central
+    differences of changed lenses, for each of which rays are aimed again, are derivatives at fixed
+    stop points."""
     lens, field = drt_jax.load_lens("cooke_triplet"), np.radians(14)
     given = lens, field, np.inf, (0.55,)
     values = _peers.shifted(lens)
@@ -161,7 +162,7 @@ def test_our_nodes_through_another_tracer_come_to_the_reference(monkeypatch):
     (moved,), _ = _curves.tried(ways, lambda found: error(*found))
     assert 1e-11 < moved.error < 1e-5
 
-    # All variants, as a run of tolerances asks for them.
+    # All variants, as in a tolerance analysis.
     some = [reference(changed(lens, row), *given[1:], slopes=False) for row in values[:3]]
 
     def worst(found):
@@ -176,7 +177,7 @@ FREQUENCIES = np.array([20.0, 60.0, 150.0])
 
 @pytest.mark.slow
 def test_the_reference_of_waves_is_the_closed_form_of_a_perfect_lens():
-    """A paraboloid of f/10, on its axis: contrast of its pupil, and nearly the Airy pattern."""
+    """For a paraboloid of f/10 on its axis: contrast of its pupil, and nearly the Airy pattern."""
     stop = {"radius": np.inf, "thickness": 60, "glass": "air", "semi_diameter": 5, "stop": True}
     mirror = {"radius": -200, "conic": -1, "mirror": True, "semi_diameter": 6}
     lens = drt_jax.load_lens({"surfaces": [stop, mirror], "sensor": -40})

@@ -1,4 +1,4 @@
-"""Random scenes made to break the tracer, a small part of `python -m experiments.stability`."""
+"""Difficult random scenes, a small part of `python -m experiments.stability`."""
 
 from functools import partial
 
@@ -15,17 +15,17 @@ SCENES = 16
 # One static structure, so that a few compiled programs serve all: five surfaces, the stop third.
 NAMES = ("curvature", "asphere", "index", "edge", "close", "touching", "distance", "focus", "field")
 NAMES += ("immersed", "inside focus", "collimated", "virtual image", "virtual object")
-# Stops that are labels: one structure. `test_starts` has the family "offaxis". Rims that fail (the
-# family "rims") take as long as all others; results/stability has them, test_clipped and
-# test_apertures their rays.
+# Stops that are labels: one structure. `test_starts` has the family "offaxis". The family "rims",
+# whose rays fail at rims, takes as long as all others: results/stability has it, and test_clipped
+# and test_apertures test such rays.
 LABELS = {"phone": 3}
-# Rays in 10,000 that Snell's law can trace and we do not find.
+# Rays in 10,000 that a sequential trace finds and we do not.
 LIMIT = 1
 
 
 def test_bounds_of_counts():
-    """The rule of three; 1 of 10 by Clopper and Pearson, whose upper limit solves
-    (1 - p)^10 + 10 p (1 - p)^9 = 0.05."""
+    """The rule of three; and 1 of 10 by Clopper and Pearson, whose upper limit solves (1 - p)^10 +
+    10 p (1 - p)^9 = 0.05."""
     assert bound(0, 620) == pytest.approx(3 / 620, rel=5e-3)
     p = bound(1, 10)
     assert (1 - p) ** 10 + 10 * p * (1 - p) ** 9 == pytest.approx(0.05)
@@ -70,14 +70,14 @@ def test_the_families_hold_rays_of_every_kind(rows):
 
 @pytest.mark.slow
 def test_rays_that_exist_are_found(rows):
-    found = [row for row in rows.values() if row["name"] != "touching"]  # a limit with a name
+    found = [row for row in rows.values() if row["name"] != "touching"]  # its limit is known
     lost, rays = (sum(row[key] for row in found) for key in ("traceable", "rays"))
     assert 1e4 * lost <= LIMIT * rays
 
 
 @pytest.mark.slow
 def test_float32_of_a_camera_within_a_tenth_of_a_micrometre():
-    """99 % of rays of perturbed triplets, all surfaces and the sensor."""
+    """For 99 % of the rays of perturbed triplets, on all surfaces and the sensor."""
     scenes = next(draw("camera, float32", 100, 1, ("cooke_triplet",)))
     single = _survey._plain(*scenes)
     double = _survey._plain(*jax.tree.map(np.float64, scenes))

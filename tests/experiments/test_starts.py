@@ -1,4 +1,4 @@
-"""Every experiment runs from settings to pictures, with as little as its settings allow."""
+"""Every experiment runs from settings to figures, as small as its settings allow."""
 
 import importlib
 import json
@@ -74,12 +74,12 @@ STARTS = {
 # Programs of many kinds.
 LONG = ("benchmark", "elements", "faults", "files", "images", "joint", "skips", "stability")
 LONG += ("temperature",)
-# Those that tests of their own start, in `test_NAME`.
+# Experiments that have tests of their own, in `test_NAME`.
 ELSEWHERE = ("accuracy", "design", "render", "tolerance", "zoom")
 
 
 def runnable():
-    """Names of what `python -m experiments.NAME` runs; those that begin with _ are parts."""
+    """Names that `python -m experiments.NAME` runs; modules whose names start with _ are parts."""
     names = [m.name for m in pkgutil.iter_modules(experiments.__path__) if m.name[0] != "_"]
     files = {name: importlib.util.find_spec(f"experiments.{name}").origin for name in names}
     main = '\nif __name__ == "__main__":'
@@ -87,7 +87,7 @@ def runnable():
 
 
 def test_each_experiment_is_started_somewhere():
-    """Those of the paper in `test_experiments`; the rest here or in files of their own."""
+    """Those of the paper in `test_experiments`; the others here or in files of their own."""
     assert runnable() == {*STARTS, *ELSEWHERE, *TOY, "tables"}
     for name in ELSEWHERE:
         text = (pathlib.Path(__file__).parent / f"test_{name}.py").read_text()
@@ -100,7 +100,7 @@ def checked_stability(results):
 
 
 def checked_requested(results):
-    """float64 keeps all; float32 keeps or refuses."""
+    """float64 keeps all tolerances; float32 keeps or refuses them."""
     assert {row["dtype"] for row in results["rows"]} == {"float64", "float32"}
     for row in results["rows"]:
         assert row["refused"] if row["error"] is None else row["error"] <= row["tolerance"]
@@ -114,7 +114,7 @@ def checked_faults(results):
 
 
 def toy_files(folder):
-    """A file and a listing that fits it, and a file that is none."""
+    """A file with a listing that agrees with it, and a file that is not a lens file."""
     save_lens(load_lens("singlet"), folder / "singlet.zmx")
     focal = first_order(load_lens("singlet"), np.inf, [0.5875618]).effective_focal_length[0]
     (folder / "singlet.txt").write_text(f"Effective Focal Length :  {float(focal):.4f}\n")
@@ -123,13 +123,14 @@ def toy_files(folder):
 
 
 def checked_files(results):
-    """Ours, and of each peer that it is not there."""
+    """Our result, and for each peer the note that it is not installed."""
     outcomes = [row["outcome"] for row in results["rows"]]
     assert outcomes == ["refused", "absent", "absent", "right", "absent", "absent"]
 
 
 def checked_benchmark(results):
-    """A curve of ours, of each peer that it is not there, the counts and the machine."""
+    """A curve of ours, for each peer the note that it is not installed, the counts and the
+    machine."""
     (row,) = results["curves"]
     low, middle, high = row["quartiles_s"]
     assert row["program"] == "drt_jax" and row["error"] < 1e-8 and 0 < low <= middle <= high
@@ -147,7 +148,7 @@ def checked_benchmark(results):
 
 
 def checked_skips(results):
-    """The order from the error traces fewer rays, to the tolerance, than one that is safe."""
+    """The order from the error traces fewer rays, within the tolerance, than a generous order."""
     (row,) = results["rows"]
     fitted, generous = row["ways"]
     assert fitted["rays"] < generous["rays"] == 12 * 13
@@ -156,14 +157,14 @@ def checked_skips(results):
 
 
 def checked_devices(results):
-    """One device alone adds nothing up."""
+    """A single device has no all-reduce."""
     (row,) = results["rows"]
     assert row["step_s"] > 0 == row["loss_apart"] == row["carried_bytes"]
     assert results["weights"] == 9 * 3 * 4 + 4 + 9 * 4 * 3 + 3
 
 
 def checked_images(results):
-    """Every model near its limit; peers that are missing have their reason."""
+    """Every model is close to its limit; for missing peers there is a reason."""
     errors = {row["model"]: row["error"] for row in results["kernels"]}
     assert errors["gaussian"] is None and errors["rays"] < 0.1 and errors["waves"] < 0.02
     assert {row["note"] for row in results["peers"]} == {"no program of this kind"}
@@ -171,7 +172,7 @@ def checked_images(results):
 
 
 def checked_elements(results):
-    """Both sides of two surfaces, and the best lens with a smaller spot than the singlet."""
+    """Both directions at two surfaces; the best lens has a smaller spot than the singlet."""
     first, *others, last = results["rows"]
     assert first["elements"] == 1 and {row["elements"] for row in (*others, last)} == {2}
     assert 1 <= len(others) <= 4 and others[0]["merit"] < first["merit"]
@@ -179,7 +180,8 @@ def checked_elements(results):
 
 
 def checked_temperature(results):
-    """Focus moves as first-order optics has it, to a tenth: spherical aberration changes little."""
+    """The focus moves as first-order optics predicts, to a tenth: spherical aberration changes
+    little."""
     cold, hot = results["rows"]
     lens = load_lens("singlet")
     model = design.ThermalModel.from_lens(lens, 19.0)
@@ -193,7 +195,7 @@ def checked_temperature(results):
 
 
 def checked_joint(results):
-    """Every arm trained and judged, and none left the lens that it may not change."""
+    """Every arm is trained and evaluated, and its lens is the one that it should have."""
     rows = {row["arm"]: row for row in results["rows"]}
     assert list(rows) == results["arms"] and len(rows) == 7
     assert all(0 < row["mae"] < 0.6 and row["step_s"] > 0 for row in rows.values()), rows
@@ -234,8 +236,8 @@ def test_a_joint_run_that_stops_resumes_to_the_same_numbers(tmp_path, monkeypatc
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:size: ")
 def test_a_filter_in_front_of_the_network_and_the_best_stop(tmp_path):
-    """Least squares on the error of the filter find a better lens for it than those on spots.
-    Photographs of a folder judge, too; and one scene of a map has no network."""
+    """For the filter, least squares on its error finds a better lens than least squares on spots.
+    Photographs of a folder are evaluated, too; and one scene of a map has no network."""
     (photos := tmp_path / "photos").mkdir()
     for k, colour in enumerate((0, 0, 40, 40, 90, 90)):
         pixels = np.random.default_rng(k).integers(0, 160, (90, 90, 1)) + [0, colour, 0]
@@ -293,7 +295,7 @@ def test_it_ends_with_results_tables_and_pictures(name, tmp_path, monkeypatch, c
 
 
 def test_a_peer_that_fails_is_a_note(monkeypatch):
-    """As with one that is missing, nothing of it is timed."""
+    """As for a missing peer, no time is measured."""
 
     def fails():
         raise ValueError("no program of this kind")

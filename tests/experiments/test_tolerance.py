@@ -1,4 +1,4 @@
-"""experiments.tolerance at toy size: rows, tables, pictures, resuming, bad settings."""
+"""experiments.tolerance at toy size: rows, tables, figures, resuming, invalid settings."""
 
 import json
 from typing import get_args
@@ -27,7 +27,7 @@ def main(*argv):
 
 @pytest.fixture(scope="module")
 def config(tmp_path_factory):
-    """The settings as a file."""
+    """A file with the settings."""
     path = tmp_path_factory.mktemp("tolerance") / "some.yaml"
     path.write_text(json.dumps(SETTINGS))
     return path

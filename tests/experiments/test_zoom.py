@@ -1,4 +1,4 @@
-"""experiments.zoom at toy size: two positions of two lenses."""
+"""experiments.zoom at toy size: two zoom positions of two lenses."""
 
 import json
 import pathlib
@@ -60,7 +60,7 @@ YFIE 2 2 4 0 0
 
 
 def run_of(folder, *more):
-    """Results of a search of the toy, in a folder."""
+    """Results of a search at toy size, in a folder."""
     (folder / "toy.zmx").write_text(TOY)
     few = [f"lens={folder / 'toy.zmx'}", "order=2", "trials=60", "tolerance=0.1"]
     few += ["moving=[{kind: thickness, surfaces: [1], low: 1, high: 40}, {kind: sensor}]"]
@@ -118,8 +118,7 @@ def test_as_many_values_as_configurations_are_asked_for(tmp_path, capsys):
 
 @pytest.mark.slow
 def test_the_macro_lens_focuses_to_its_magnifications():
-    """The file's object distances and gaps: paraxial foci, in which the pictures of the groups are
-    infinity, 1:4 and 1:2."""
+    """The object distances and gaps of the file are paraxial foci for infinity, 1:4 and 1:2."""
     path = ROOT / zoom.Config().lens.replace("us5568323", "us5257137")
     systems = [drt_jax.load_system(path, configuration=k) for k in (1, 2, 3)]
     for system, wanted in zip(systems, (0, -0.25, -0.5)):

@@ -1,4 +1,4 @@
-"""Catalogues of glasses in Zemax's form."""
+"""Catalogues of glasses in Zemax's format."""
 
 import re
 
@@ -12,7 +12,7 @@ from drt_jax.lens.glass import Glass
 from drt_jax.lens.glasses import find_glass, indices
 
 
-# Zemax's formulas with constants of no glass, and n^2 at 0.6 um as its manual writes them.
+# Zemax's formulas with invented constants, and n^2 at 0.6 um by the formulas of its manual.
 def terms(*pairs):
     return sum(b * 0.36 / (0.36 - c) for b, c in pairs)
 
@@ -83,7 +83,8 @@ def test_what_is_no_catalogue_is_refused_in_a_line(tmp_path, message):
 
 
 def test_a_prescription_names_its_catalogues(tmp_path):
-    """What it does not use may be of any formula; its glasses win over the table."""
+    """Glasses that it does not use may have any formula; its glasses take precedence over the
+    table."""
     own = ("MINE", 12, FORMULAS[12][0]), ("N-BK7", 2, "1.3 .01"), ("X", 3, "1")
     mine = "".join(glass_of(*one) for one in own)
     (tmp_path / "my.agf").write_text(mine)
@@ -111,8 +112,9 @@ surfaces:
 
 
 def test_glasses_of_a_maker_in_files(tmp_path):
-    """NAME_MAKER in a prescription; in `.zmx` the catalogues say it, as far as they can: of F2 and
-    Hikari's SK16 no order finds both, so one keeps its maker in its name."""
+    """NAME_MAKER in a prescription; in `.zmx` the order of the catalogues determines the maker,
+    where possible. No order gives both Schott's F2 and Hikari's SK16, so that one of them keeps the
+    maker in its name."""
     names = ("SK16", "F2", "S-BSM14", "SK16_SCHOTT")
     for some in (names[:2], names[1:3], names[1:]):
         surfaces = [
@@ -131,7 +133,7 @@ def test_glasses_of_a_maker_in_files(tmp_path):
 
 
 def test_temperature_and_status(tmp_path):
-    """Lines of Schott's and Zeon's catalogues; zeros and missing words are what is not known."""
+    """Lines of Schott's and Zeon's catalogues; zeros and missing words are unknown values."""
     path = tmp_path / "my.agf"
     path.write_text(
         "NM F2 2 620364.361 1.62004 36.37 0 1 2\nED 8.200000 9.200000 3.610000 0.0002 0\n"

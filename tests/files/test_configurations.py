@@ -13,8 +13,8 @@ WAVES, DISTANCES = (0.48, 0.55, 0.65), (np.inf, 1000.0, 500.0)
 
 @pytest.fixture(scope="module")
 def systems():
-    """A triplet that focuses by two gaps, bends a surface, and stops down; weights of all. A conic
-    and vignetting stand in the second alone."""
+    """A triplet that focuses by two gaps, with a variable curvature and stop, a conic and
+    vignetting in the second configuration alone; and weights of everything."""
     lens = load_lens("cooke_triplet")
     numbers = {
         "sensor": (42.2, 45.1, 47.3),
@@ -49,7 +49,8 @@ def test_all_configurations_come_back(systems, kind, tmp_path):
 
 
 def test_an_angle_in_a_file_is_seen_from_the_entrance_pupil(systems):
-    """Of an object point of known height: tan of its angle is the height over the distance."""
+    """For an object point of known height, the tangent of its angle is the height divided by the
+    distance to the entrance pupil."""
     near = systems[1]
     place = first_order(near.lens, np.inf, 0.55).entrance_pupil.position[0]
     height = 1000 * np.tan(np.radians(14))
@@ -79,8 +80,8 @@ def test_a_telecentric_lens_is_written(distance, tmp_path):
 
 
 def test_rows_are_those_of_a_patents_file(shared, tmp_path, capsys):
-    """A zoom of another program's file: its gaps stand in the rows as they do there; through a
-    `.seq` file, all three positions keep their focal lengths."""
+    """A zoom from a file of another program: its gaps are written in the same rows; after
+    conversion to `.seq`, all three positions have the same focal lengths."""
     given = shared / "wild" / "Ricoh_smc_Pentax-FA_28-70mm_F2.8_AL_1d59b8.zmx"
     main(["convert", str(given), str(tmp_path / "zoom.zmx")])
     main(["convert", str(given), str(tmp_path / "zoom.seq")])

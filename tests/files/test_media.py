@@ -1,4 +1,4 @@
-"""Model glasses and those of the file, and the patent lens that is made of them."""
+"""Model glasses, glasses that a file defines, and a patent lens with such glasses."""
 
 import jax
 import numpy as np
@@ -12,7 +12,8 @@ from drt_jax.files.written import medium_of
     "entry", [{"nd": 1.835, "vd": 42.7}, {"glass": 835427}, {"glass": "835427"}]
 )
 def test_model_glasses(entry):
-    """As patents give them, and as a code; between two of the same, no light bends."""
+    """By nd and vd as in patents, and by a code; a surface between two equal media does not
+    refract."""
     rows = [
         {"radius": 50.0, "thickness": 4.0, **entry},
         {"radius": "inf", "thickness": 2.0, **entry},
@@ -26,7 +27,7 @@ def test_model_glasses(entry):
 
 
 def test_glasses_of_the_file():
-    """They win over the catalogue, have a range of their own, and n^2 is the sum of both forms."""
+    """They take precedence over the catalogue and have a range; n^2 is the sum of both formulas."""
     rows = [
         {"radius": 50.0, "thickness": 4.0, "glass": "SK16"},
         {"radius": "inf", "thickness": 50.0, "stop": True, "semi_diameter": 5.0},
@@ -53,7 +54,7 @@ def test_air_has_no_name_in_a_file_of_float32_either():
 
 
 def test_the_patent_lens(shared):
-    """US 2021/0263286, example 1, as it stands: the focal length that the patent tells."""
+    """US 2021/0263286, example 1, as printed, has the focal length of the patent."""
     lens = load_lens(shared / "patent_rf50.yaml")
     focal = first_order(lens, np.inf, [0.5875618]).focal_length
     np.testing.assert_allclose(focal, 49.565, atol=5e-3)

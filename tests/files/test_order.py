@@ -13,7 +13,7 @@ MIRROR = {"radius": -100.0, "mirror": True, "semi_diameter": 20.0}
 
 
 def in_order(*surfaces):
-    """Surfaces and the distances between and behind them, in turns, as a prescription."""
+    """A prescription from surfaces and the distances behind them, alternately."""
     return {
         "surfaces": [
             {**surface, "thickness": gap} for surface, gap in zip(surfaces[::2], surfaces[1::2])
@@ -44,7 +44,7 @@ def test_a_stop_that_bends_no_light_may_lie_anywhere(name):
 
 
 def test_stop_plane_that_touches_a_lens(shared):
-    """P01, which OpticStudio has traced: the stop at 0 mm before R = 20."""
+    """P01, which OpticStudio has traced: the stop is 0 mm in front of R = 20."""
     cases = yaml.safe_load((shared / "psf_cases.yaml").read_text())["cases"]
     stop, front, back = cases[0]["prescription"]["surfaces"]
     lens = load_lens(
@@ -60,7 +60,7 @@ def test_stop_plane_that_touches_a_lens(shared):
 
 
 def test_index_1_is_air():
-    """A surface between them bends no light, so that it need not keep its order."""
+    """A surface in air bends no light, so that its order is free."""
     surfaces = in_order(FRONT, 1.0, BACK | {"index": 1.0}, 5.0, {"radius": 9.0}, -5.0, STOP, 20.0)
     lens = load_lens({"object": {"index": 1}, **surfaces})
     assert lens.glasses == ("air", "index 1.5", "air", "air", "air") and lens.active == (0, 1)
@@ -105,7 +105,7 @@ def test_surfaces_that_bend_light_keep_their_order(name):
 
 
 def test_a_sensor_in_front_of_the_last_surface_shows_a_virtual_image():
-    """Behind a lone stop, which bends no light, it may lie anywhere."""
+    """Behind a stop alone, which bends no light, it may lie anywhere."""
     with pytest.warns(UserWarning, match="sensor: 0 mm lies before the vertex of surface 1 at 1"):
         load_lens(in_order(FRONT, 1.0, BACK, -2.0, STOP, 1.0))
     with pytest.warns(UserWarning, match="as a mirror has turned the light: rays are prolonged"):
@@ -129,7 +129,7 @@ def test_zeros_that_are_written_are_variables_and_turn_off_no_check(key, zeros):
 
 @pytest.mark.parametrize("key, value", [("decentre", [0, 0.1]), ("tilt", [0, 0, 1.0])])
 def test_only_neighbours_of_a_moved_surface_are_not_checked(key, value):
-    """A mirror at 45 degrees sends light sideways; its neighbours may lie at any z."""
+    """A mirror at 45 degrees reflects light sideways; its neighbours may have any z."""
     moved = {key: value}
     first, second = (FRONT, 1.0, BACK), (FRONT, -1.0, BACK)
     load_lens(in_order(*first, 2.0, STOP, 2.0, FRONT | moved, -1.0, BACK, 20.0))
@@ -145,8 +145,8 @@ def test_only_neighbours_of_a_moved_surface_are_not_checked(key, value):
 
 
 def test_surfaces_that_cross_outside_of_the_light():
-    """Apertures of 10 mm, where the faces meet at 8.75 mm: a warning while the beam of the axis is
-    narrower, as in files whose apertures a program chose."""
+    """With apertures of 10 mm the faces cross at 8.75 mm. There is only a warning if the axial beam
+    is narrower, as in files whose apertures a program has chosen."""
     rows = (WIDE, 4.0, {**BACK, "semi_diameter": 10.0}, 20.0)
     with pytest.warns(UserWarning, match="cross at 8.72 mm.*light that comes there is lost"):
         load_lens(in_order(STOP, 0.0, *rows))
@@ -156,7 +156,8 @@ def test_surfaces_that_cross_outside_of_the_light():
 
 @pytest.mark.slow
 def test_surfaces_that_cross_at_the_rim():
-    """A rounded aperture: the lens loads with a warning, and light that comes there is lost."""
+    """With a rounded aperture the lens loads with a warning, and rays that arrive there are
+    lost."""
     rows = [
         {"radius": 20.0, "thickness": 4.2, "index": 1.5, "semi_diameter": 9.0},
         {"radius": -20.0, "thickness": 1.0, "semi_diameter": 9.0},

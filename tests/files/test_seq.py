@@ -1,4 +1,4 @@
-"""`.seq` files: each command by its meaning, CODE V's own listings, and what is no file."""
+"""`.seq` files: the meaning of each command, CODE V's own listings, and invalid files."""
 
 import re
 import time
@@ -30,12 +30,13 @@ def written(folder, *lines, **others):
 
 
 def record(folder, *lines, missing="error", configuration=None, **others):
-    """What is read, without a lens of it."""
+    """The record that is read, before a lens is built."""
     return read_record(written(folder, *lines, **others), missing, configuration)
 
 
 def entry(folder, *lines, at=0, **others):
-    """The entries of a surface of its kind, behind the first and before the last."""
+    """The entries of a surface with these commands, behind the first surface and before the
+    last."""
     found = record(folder, FRONT, *lines, "S 0 5", **others)
     return [part.entry for part in found.parts if not isinstance(part, Breaking)][1 + at]
 
@@ -53,7 +54,8 @@ def read(folder, *lines, missing="error", **others):
 
 
 def test_lines_comments_quotes_and_letters(tmp_path):
-    """`;` and lines part commands, `!` ends a line, `&` continues it, quotes guard all three."""
+    """`;` and new lines separate commands, `!` starts a comment, `&` continues a line; none of them
+    does inside quotes."""
     lines = ["s 50 & ! first\n 4 nbk7_schott ! 500.625", "STOP; ThiCK 7", "S -50&\n 48;"]
     found = record(tmp_path, *lines, head=HEAD.replace("'a lens'", '"it\'s; 5! & up"'))
     rows = [part for part in found.parts if not isinstance(part, Breaking)]
@@ -61,7 +63,7 @@ def test_lines_comments_quotes_and_letters(tmp_path):
     assert rows[0].entry == {"curvature": 0.02, "glass": "N-BK7", "stop": True}
     assert found.notes == [] and found.use.wavelengths == [0.55, 0.48]
     messages = refused(tmp_path, FRONT, "S -50 &\n 1.2.3")
-    assert ", line 10: expected a number, got '1.2.3'" in messages  # where the command begins
+    assert ", line 10: expected a number, got '1.2.3'" in messages  # its first line
 
 
 def test_radii_curvatures_and_units(tmp_path):
@@ -70,7 +72,7 @@ def test_radii_curvatures_and_units(tmp_path):
     curved = HEAD.replace("RDM;", "RDM N;")
     same = read(tmp_path, f"S .02 4 NBK7_SCHOTT; STO; {even}", "S -.02 48", head=curved).lens
     np.testing.assert_array_equal(mm.lens.curvature, same.curvature)
-    assert float(mm.lens.coefficients[0, 1]) == 1e-5  # A is of r^4, J of r^20: no I
+    assert float(mm.lens.coefficients[0, 1]) == 1e-5  # A is r^4, J is r^20; there is no I
     assert float(mm.lens.coefficients[0, 9]) == 1e-20 and float(mm.lens.conic[0]) == -0.5
     inch = read(tmp_path, f"{FRONT}; {even}", BACK, head=HEAD.replace("DIM M", "DIM I"))
     scale = 25.4
@@ -100,7 +102,8 @@ def test_use_of_a_lens(tmp_path):
 
 @pytest.mark.slow
 def test_apertures_of_systems_and_kinds_of_fields(tmp_path):
-    """EPD, FNO, NA, NAO by their definition: NA is NAO over the magnification, FNO 1 / (2 NA)."""
+    """EPD, FNO, NA, NAO by their definitions: NA is NAO divided by the magnification, FNO 1 / (2
+    NA)."""
 
     def first(own, object="SO 0 200", fields="YAN 0 5"):
         head = HEAD.replace("EPD 10", own).replace("YAN 0 5", fields)
@@ -127,7 +130,7 @@ def test_apertures_of_systems_and_kinds_of_fields(tmp_path):
 
 
 def test_glasses(tmp_path):
-    """Names without hyphens and their maker; codes; nd:vd; a mirror keeps the medium."""
+    """Names without hyphens with their maker; codes; nd:vd; a mirror keeps the medium."""
     assert code_of("517642") == (1.517, 64.2) and code_of("569.631") == (1.569, 63.1)
     assert code_of("516800.641700") == (1.5168, 64.17) and code_of("1.5168:64.17") == (
         1.5168,
@@ -150,7 +153,7 @@ def test_glasses(tmp_path):
 
 
 def test_private_glasses(tmp_path):
-    """A table passes through its indices, formulas have their constants."""
+    """A table passes through its indices; formulas have their constants."""
     waves = np.array([0.7, 0.65, 0.6, 0.55, 0.5, 0.48])
     true = np.asarray(load_lens("singlet").index(waves)[2])
     prv = f"PRV\nPWL {' '.join(map(repr, (1000 * waves).tolist()))}\n'TAB' &\n"
@@ -160,7 +163,7 @@ def test_private_glasses(tmp_path):
     np.testing.assert_allclose(lens.index(0.52)[1], load_lens("singlet").index(0.52)[2], rtol=1e-6)
     with pytest.raises(ValueError, match="outside the range of TAB, 0.48 to 0.7"):
         lens.index(0.8)
-    # Of more than six, those at the file's wavelengths, here 550 and 480 nm, hold.
+    # With more than six indices, those at the file's wavelengths, here 550 and 480 nm, are exact.
     more = np.round(np.linspace(0.4, 0.9, 51), 3)
     rough = np.round(np.asarray(load_lens("singlet").index(more)[2]), 4)
     numbers = f"PWL {' '.join(map(repr, (1000 * more).tolist()))}\n'T' "
@@ -228,7 +231,8 @@ def assert_close(found, wanted):
 
 @pytest.mark.slow
 def test_a_zone_plate_focuses_as_its_optical_path_says(tmp_path):
-    """OPD C1 r^2 at HWL is that of a thin lens of f = -1 / (2 C1); f goes as 1 / wavelength."""
+    """The optical path C1 r^2 at HWL is that of a thin lens with f = -1 / (2 C1); f is proportional
+    to 1 / wavelength."""
     own = "S 0 9; STO; DIF DOE; HOR 1; HWL 550; HCT R; HCO C1 -.005"
     system = read(tmp_path, own, "S 0 91", head=HEAD.replace("DIM M", "DIM C"))
     found = first_order(system.lens, np.inf, jnp.array([0.55, 0.5]))
@@ -237,7 +241,7 @@ def test_a_zone_plate_focuses_as_its_optical_path_says(tmp_path):
 
 @pytest.mark.slow
 def test_fringe_polynomials(tmp_path):
-    """Spherical aberration (9) is 6 r^4 - 6 r^2 + 1, 5 and 6 astigmatism, 8 coma along y."""
+    """9, spherical aberration, is 6 r^4 - 6 r^2 + 1; 5 and 6 are astigmatism, 8 is coma along y."""
     shapes = {
         9: lambda x, y: 6 * (x * x + y * y) ** 2 - 6 * (x * x + y * y) + 1,
         5: lambda x, y: x * x - y * y,
@@ -253,7 +257,8 @@ def test_fringe_polynomials(tmp_path):
 
 
 def test_what_clips(tmp_path):
-    """EDG never clips, CIR is a rim, the others by label; HOL and OBS block; ARO turns by 90."""
+    """EDG never clips, CIR is a semi-diameter, the others have labels; HOL and OBS are
+    obscurations; ARO rotates by 90 degrees."""
     assert entry(tmp_path, "S 9 1; CIR 3; CIR EDG 2")["semi_diameter"] == 3
     own = "S 9 1; REX L'A' 1; REY L'A' 2; ADX L'A' 3; ADY L'A' -4"
     own += "; CIR OBS L'B' .5; ELX HOL 1; ELY HOL 2"
@@ -264,7 +269,7 @@ def test_what_clips(tmp_path):
     assert entry(tmp_path, "S 9 1; XTO; REX 1; REY 2")["aperture"] == [{"rectangle": [2, 1]}]
     assert "semi_diameter" not in entry(tmp_path, "CA NO\nS 9 1; CIR 3")
     assert "turned by 30 degrees" in refused(tmp_path, FRONT, "S 9 1; REX 1; REY 2; ARO 30")
-    # A circle on the stop that is as wide as EPD asks is the stop itself; a narrower one clips.
+    # A circle on the stop whose size agrees with EPD is the stop itself; a narrower one clips.
     same = read(tmp_path, f"{FRONT}; CIR 5.0000000001", BACK).lens
     assert same.apertures is None and float(same.semi_diameter[0]) == 5.0000000001
     assert float(read(tmp_path, f"{FRONT}; CIR 4", BACK).lens.apertures.half[0, 0]) == 4
@@ -279,7 +284,8 @@ def places(lens):
 
 @pytest.mark.slow
 def test_where_surfaces_stand(tmp_path):
-    """Basic, BEN, REV, RET and DAR, against geometry; ray-optics 0.9.8 has the same places."""
+    """Basic decentres, BEN, REV, RET and DAR, compared with geometry; ray-optics 0.9.8 has the same
+    positions."""
     folded = read(tmp_path, FRONT, "S -50 20", "S 0 -30 REFL; ADE 45; BEN", "S 9 -1 F2", "S 0 -3")
     points, turned = places(folded.lens)
     # Left-handed about x: the mirror's normal lies between +z and +y, light goes down to -y.
@@ -318,7 +324,8 @@ GO"""
 
 
 def own_hits(system, field, points):
-    """Where rays through (x, y, 0) meet each surface, along its own axes, by the oracle."""
+    """Intersections of the rays through (x, y, 0) with each surface, along its own axes, by the
+    oracle."""
     wave = [system.wavelengths[system.primary]]
     scene = oracle.Scene.of(system.lens, field, np.inf, wave)
     x, y = (np.array([part]) for part in np.array(points).T)
@@ -328,7 +335,7 @@ def own_hits(system, field, points):
 
 @pytest.mark.slow
 def test_listed_rays_through_tilted_mirrors(tmp_path):
-    """The hand of ADE, DAR, the defocus of a tilted image, the signs of fields: to 1e-5 mm, as
+    """The sign of ADE, DAR, the defocus of a tilted image, the signs of fields: to 1e-5 mm, because
     radii are printed to 1e-5."""
     path = tmp_path / "mirrors.seq"
     path.write_text(MIRRORS)
@@ -343,7 +350,7 @@ def test_listed_rays_through_tilted_mirrors(tmp_path):
     np.testing.assert_allclose(skew[2, 0], [0, 0, 0], atol=1e-5)
     np.testing.assert_allclose(skew[4, 0], [24.575385, -139.197865, -22.687357], atol=1e-5)
     np.testing.assert_allclose(skew[5, 0], [14.086350, -14.325065, 0], atol=1e-5)
-    # The same tertiary as its other listing has it, SPS QBF with five digits.
+    # The same tertiary from another listing, as SPS QBF with five digits.
     forbes = "SPS QBF; SCO NRADIUS 189.86; SCO C3 .42605; SCO C4 -.016782; SCO C5 8.2673E-04"
     forbes += "; SCO C6 -4.4487E-05; SCO C7 2.5242E-06; SCO C8 -1.3595E-07"
     own = MIRRORS.replace("ASP; K .226106; A .36895E-10", forbes).replace(
@@ -379,10 +386,10 @@ GO"""
 
 @pytest.mark.slow
 def test_listed_double_gauss(tmp_path):
-    """CODE V 10.8 on a file of its own: indices, first order, rays, to the last printed digit."""
+    """CODE V 10.8 for its own file: indices, first-order data, rays, to the last printed digit."""
     path = tmp_path / "gauss.seq"
     path.write_text(GAUSS)
-    with pytest.warns(UserWarning, match=r"line 16: solves and pickups are read as the values"):
+    with pytest.warns(UserWarning, match=r"line 16: solves and pickups are read as their"):
         system = load_system(path)
     glasses = np.asarray(system.lens.index(system.wavelengths))[[1, 3, 4, 8]]
     listed = [[1.618769, 1.622292, 1.630455], [1.604134, 1.607379, 1.614860]]
@@ -404,7 +411,8 @@ def test_listed_double_gauss(tmp_path):
 
 
 def test_later_changes_solves_and_zooms(tmp_path):
-    """Of a named surface or several, also by its line again; of zoom positions one."""
+    """For a named surface or several, also by a second line of a surface; of the zoom positions
+    one."""
     later = ["THI S1 5; CUY S2 -.03; THI S2 PIM", "GLA S1 F2", "S1 40 6"]
     found = record(tmp_path, FRONT, BACK, *later)
     rows = found.parts
@@ -456,7 +464,7 @@ def test_what_is_not_read_is_refused_by_line(tmp_path):
 
 
 def assert_same(one, two):
-    """Two lenses, but for the names of glasses, to 17 digits."""
+    """Asserts that two lenses agree to 17 digits, except the names of glasses."""
     for key in ("curvature", "conic", "thickness", "semi_diameter", "sensor", "decentre", "tilt"):
         np.testing.assert_array_equal(getattr(one, key), getattr(two, key))
     width = min(one.coefficients.shape[1], two.coefficients.shape[1])
@@ -503,7 +511,7 @@ def test_written_forms_glasses_apertures_and_places(tmp_path):
     assert lens.phase.forms == again.phase.forms
     np.testing.assert_allclose(lens.phase.coefficients, again.phase.coefficients, rtol=3e-16)
     assert " 5168.6417\n" in (tmp_path / "own.seq").read_text()
-    # Turns of the axis: with their numbers where they stand at a vertex, else to rounding.
+    # Rotations of the axis: with the same numbers if the pivot is a vertex, else to rounding.
     turns = ["S 0 3; YDE 1; ADE 20; CDE 3", "S 9 1 F2", "S 0 -9 REFL; BDE 30; BEN", "S 0 -5"]
     lens = read(tmp_path, FRONT, BACK, *turns[:2], "S 0 9").lens
     save_lens(lens, tmp_path / "own.seq")
@@ -522,7 +530,7 @@ def test_written_forms_glasses_apertures_and_places(tmp_path):
 
 
 def test_powers_that_asp_has_not(tmp_path):
-    """An even asphere with r^2 or r^22 is an SPS ODD: the same sag."""
+    """An even asphere with r^2 or r^22 becomes an SPS ODD with the same sag."""
     rows = [{"radius": 50, "thickness": 3, "index": 1.5, "semi_diameter": 5, "stop": True}]
     own = {"radius": -50, "conic": -1, "coefficients": {2: 1e-3, 4: 1e-6, 22: 1e-20}}
     lens = load_lens({"surfaces": [*rows, own], "sensor": 50.0})
@@ -566,7 +574,7 @@ def test_files_that_are_none(tmp_path):
     own = text(
         "PRV; PWL 700 600 500; 'A' 1.5 1.51 1.52; END", "S 50 4 'A'; STO; CIR 4; ASP; A 1e-6", BACK
     )
-    for _ in range(400):  # a few bytes changed, or cut: refused in a line, or read
+    for _ in range(400):  # some bytes changed or removed: an error of one line, or a lens
         spoilt = bytearray(own.encode())
         for place in noise.integers(0, len(spoilt), 4):
             spoilt[place] = noise.choice(list(b"0 9.-;&!'\"SAZ\n\xff\x00e"))

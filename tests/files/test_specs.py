@@ -1,4 +1,4 @@
-"""What a prescription may say, and what is refused before anything is traced."""
+"""Valid prescriptions, and those that raise an error before anything is traced."""
 
 import numpy as np
 import pytest
@@ -270,7 +270,7 @@ def test_every_form_from_a_file(tmp_path):
 
 @pytest.mark.slow
 def test_a_sensor_in_focus(tmp_path):
-    """Where an axial ray close to the axis crosses it; written as a number."""
+    """It is where an axial ray close to the axis crosses the axis; it is written as a number."""
     lens = load_lens(write(tmp_path, lambda e: e.update(sensor="focus")))
     (wanted,) = first_order(lens, np.inf, 0.5875618).image_distance
     assert float(lens.sensor) == pytest.approx(float(wanted), abs=1e-12)
@@ -281,7 +281,7 @@ def test_a_sensor_in_focus(tmp_path):
 
 
 def test_powers_of_json_are_numbers():
-    """A key of JSON is text: "4" is the coefficient 4, here of a Zernike polynomial."""
+    """JSON has keys as text: "4" is the coefficient 4, here of a Zernike polynomial."""
     rows = {"form": "zernike", "radius": 50, "norm_radius": 9, "thickness": 9, "index": 1.5}
     stop = {"radius": -50, "thickness": 90, "stop": True, "semi_diameter": 5}
     for keys in ({"4": 0.01, "11": 0.02}, {4: 0.01, "11": 0.02}):

@@ -71,7 +71,8 @@ CASES = {
 
 
 def test_a_lens_that_a_program_returns_keeps_its_glasses(tmp_path):
-    """Its names are lost, as the program serves lenses of all names; constants tell the glasses."""
+    """Its names are lost, because a program serves lenses of all names; the glasses follow from the
+    constants."""
     lens = load_lens("double_gauss")
     returned = jax.jit(lambda lens: lens)(lens)
     assert returned.name == "" and returned.glasses[1] == "glass 1"
@@ -81,8 +82,8 @@ def test_a_lens_that_a_program_returns_keeps_its_glasses(tmp_path):
 
 @pytest.mark.parametrize("name", CASES)
 def test_a_lens_comes_back(name, tmp_path):
-    """Everything that is static, and every number to the last digit; those that a person has not
-    typed (a last bit beside 12 digits) exactly."""
+    """All static fields, and every number to the last digit; numbers that no person typed (which
+    differ in the last bit from 12 digits) exactly."""
     lens = load_lens(CASES[name])
     save_lens(lens, tmp_path / "lens.yaml")
     again = load_lens(tmp_path / "lens.yaml")
@@ -98,8 +99,8 @@ def test_a_lens_comes_back(name, tmp_path):
 
 
 def test_numbers_are_written_as_a_person_types_them(tmp_path):
-    """Also those that rounding has moved: a gap in front of the sensor, wavelengths in nm; while
-    what nobody typed keeps its last bit."""
+    """Also those that rounding has changed: a gap in front of the sensor, wavelengths in nm.
+    Numbers that no person typed keep their last bit."""
     lens = load_lens("cooke_triplet")
     third = float(np.nextafter(1 / 300, 1))
     curvature = lens.curvature.at[0].set(np.nextafter(0.02, 1)).at[1].set(third)
@@ -129,7 +130,7 @@ def test_the_patent_lens_comes_back(shared, tmp_path):
 
 
 def test_a_lens_that_an_optimiser_moved(tmp_path):
-    """Numbers that nobody typed; the Abbe number of a model glass among them."""
+    """Numbers that no person typed; among them the Abbe number of a model glass."""
     lens = load_lens(ODD)
     change = np.random.default_rng(0).normal(size=100)
     leaves, structure = jax.tree.flatten(lens)
@@ -145,7 +146,8 @@ def test_a_lens_that_an_optimiser_moved(tmp_path):
 
 
 def test_glasses_that_an_optimiser_moved(tmp_path):
-    """Two elements of one glass, moved apart, beside one that stayed as it is in the catalogue."""
+    """Two elements of one glass, changed differently, and a third with the glass of the
+    catalogue."""
     rows = [
         {"radius": 50, "thickness": 4, "glass": "SK16"},
         {"radius": -50, "thickness": 1, "glass": "F2"},
@@ -172,7 +174,7 @@ def test_what_a_prescription_cannot_hold(tmp_path):
         save_lens(curved, tmp_path / "lens.yaml")
     patent = load_lens({"surfaces": [{"radius": 9, "nd": 1.5, "vd": 50, "thickness": 9} | STOP]})
     melted = dataclasses.replace(patent.dispersion, strength=patent.dispersion.strength + 1e-6)
-    with pytest.raises(LensError, match=r"glasses\[1\]: a prescription has no constants beside nd"):
+    with pytest.raises(LensError, match=r"glasses\[1\]: a prescription has nd and vd and no"):
         save_lens(dataclasses.replace(patent, dispersion=melted), tmp_path / "lens.yaml")
     with pytest.raises(LensError, match="cannot be written"):
         save_lens(lens, tmp_path / "nowhere" / "lens.yaml")
@@ -190,7 +192,7 @@ def singlet(**keys):
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_constant_index_is_a_glass_of_every_file(kind, tmp_path):
-    """n = 1.5 is not air; and it is written again from what is read."""
+    """n = 1.5 is not air; what is read is written again."""
     lens = singlet(index=1.5)
     save_lens(lens, tmp_path / f"one{kind}")
     for other in KINDS:
@@ -201,7 +203,8 @@ def test_a_constant_index_is_a_glass_of_every_file(kind, tmp_path):
 
 
 def test_a_model_glass_of_another_dispersion_is_a_private_glass(tmp_path):
-    """The same indices at F, d, C; elsewhere no more off than is said."""
+    """It has the same indices at F, d, C; at other wavelengths the error is at most the reported
+    one."""
     lens = singlet(nd=1.6204, vd=60.3, dPgF=0.02)
     with pytest.warns(UserWarning, match="0.365 to 1.014 um they differ by .* at most") as said:
         save_lens(lens, tmp_path / "own.seq")
@@ -216,7 +219,8 @@ def test_a_model_glass_of_another_dispersion_is_a_private_glass(tmp_path):
 @pytest.mark.parametrize("kind", [".zmx", ".seq"])
 @pytest.mark.filterwarnings("ignore:.*glasses of a code have its nd and vd")
 def test_model_glasses_survive_conversions(kind, tmp_path):
-    """A model glass of .zmx, of the normal line but for rounding, is one in each file after it."""
+    """A model glass of .zmx on the normal line, except for rounding, is a model glass in each later
+    file."""
     save_lens(singlet(nd=1.6204, vd=60.3), tmp_path / "one.zmx")
     for one, two in (("one.zmx", f"two{kind}"), (f"two{kind}", "three.zmx")):
         save_lens(load_lens(tmp_path / one), tmp_path / two)
@@ -226,7 +230,7 @@ def test_model_glasses_survive_conversions(kind, tmp_path):
 
 
 def test_what_is_read_back_otherwise_is_not_written(tmp_path, monkeypatch):
-    """An error names the difference, and the file that was there stays."""
+    """An error names the difference, and the existing file is not changed."""
     lens = singlet(index=1.5)
     others = {
         "curvature[1] -0.02": dataclasses.replace(lens, curvature=lens.curvature.at[1].mul(1.001)),
@@ -272,7 +276,8 @@ def test_endings_of_no_kind_of_file(path, tmp_path):
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_rings_and_other_apertures(kind, tmp_path):
-    """A circle in a circle is the annular aperture of .zmx; one shape on each other surface."""
+    """A circle inside a circle is the annular aperture of .zmx; other surfaces have one shape
+    each."""
     plane = {"curvature": 0.0, "thickness": 2.0}
     shapes = [
         {"semi_diameter": 4.0, "obscuration": {"circle": 1.0}},
@@ -306,7 +311,7 @@ def test_rings_and_other_apertures(kind, tmp_path):
 
 
 def test_a_sensor_that_nearly_touches_and_a_toroidal_grating(tmp_path):
-    """A gap of 1e-6 mm, which rounding of a sum makes narrower; TOROGRAT, by its radius."""
+    """A gap of 1e-6 mm, which rounding of a sum makes smaller; TOROGRAT, by its radius."""
     rows = [FRONT | {"index": 1.5}, BACK | {"thickness": 104.42}]
     glass = {"curvature": 0.0, "thickness": 1e-6}
     grating = {"form": "toroid", "radius": 90.0, "radius_x": -70.0, "thickness": 0.1 + 0.2}
@@ -330,7 +335,7 @@ USES = {
 
 
 def lost_parts_are_named(system, path, monkeypatch):
-    """A writer that loses a part of the use writes nothing."""
+    """A writer that loses a part of fields, wavelengths or aperture writes no file."""
     others = {
         "field_kind angle, read back object height": {"field_kind": "object height"},
         "primary 1, read back 2": {"primary": 2},
@@ -358,7 +363,8 @@ def lost_parts_are_named(system, path, monkeypatch):
 @pytest.mark.parametrize("kind", [".zmx", ".seq"])
 @pytest.mark.parametrize("field_kind", USES)
 def test_a_lens_with_its_fields_and_wavelengths(kind, field_kind, tmp_path, monkeypatch):
-    """What `load_system` reads is written: distance, fields, weights, vignetting, wavelengths."""
+    """All that `load_system` reads is written: distance, fields, weights, vignetting,
+    wavelengths."""
     far, heights = USES[field_kind]
     count = len(heights)
     vignetting = np.random.default_rng(0).uniform(0, 0.2, (count, 5))

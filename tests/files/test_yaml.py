@@ -49,13 +49,13 @@ BUNDLED = {
     "singlet": (100.0, 10.0, 0.5875618, 10.0),
     "telephoto_300mm": (299.9918, 5.999836, 0.5875618, 4.0),
 }
-# Traced by other tests (these), or like another that is.
+# Lenses that other tests trace, or that are like one of these.
 TRACED = {"cooke_triplet", "double_gauss", "double_gauss_addon", "singlet", "hubble"}
 LARGER = {
     *("phone_tele", "heliar_100mm", "dagor_240mm", "telephoto_300mm"),
     *("camera_50mm", "hypergon_100mm", "phone", "fisheye_8mm"),
 }
-# Down the stop along y, nearly to its edge (apertures of patents are rounded), and its side.
+# Points of the stop along y, nearly to its edge (apertures of patents are rounded), and aside.
 POINTS = jnp.array([[0.0, 0.98], [0.0, 0.5], [0.0, 0.0], [0.0, -0.5], [0.98, 0.0]])
 
 
@@ -85,7 +85,7 @@ def passed(lens, field, wavelength):
     ],
 )
 def test_light_passes_bundled_lenses(name):
-    """All of it on the axis, some of it at the half field."""
+    """All light passes on the axis, and some at half of the largest field."""
     lens, (_, _, wavelength, half) = load_lens(name), BUNDLED[name]
     on_axis, off = (passed(lens, jnp.radians(f), jnp.array(wavelength)) for f in (0.0, half))
     assert on_axis.all() and off.any()

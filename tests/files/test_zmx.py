@@ -1,4 +1,4 @@
-"""`.zmx` files: each keyword by its meaning, OpticStudio's own listings, and what is no file."""
+"""`.zmx` files: the meaning of each keyword, OpticStudio's own listings, and invalid files."""
 
 import pathlib
 import re
@@ -45,7 +45,7 @@ IMAGE = "TYPE STANDARD|CURV 0|DISZ 0"
 
 
 def text(*surfaces, object="INFINITY", tail=("MNUM 1 1",), **header):
-    """A file with these surfaces between object and image, lines parted by |."""
+    """A file with these surfaces between object and image, whose lines are separated by |."""
     top = [f"{key} {value}" for key, value in (HEADER | header).items() if value is not None]
     blocks = [f"TYPE STANDARD|CURV 0|DISZ {object}", *surfaces, IMAGE]
     for i, block in enumerate(blocks):
@@ -66,7 +66,8 @@ def refused(folder, *surfaces, **others):
 
 
 def test_use_of_a_lens(tmp_path):
-    """The first of the columns, in their order; repeated wavelengths stay; pupil diameter."""
+    """The first entries of the columns, in their order; repeated wavelengths are kept; pupil
+    diameter."""
     system = read(tmp_path)
     np.testing.assert_array_equal(system.wavelengths, [0.48, 0.55])
     np.testing.assert_array_equal(system.wavelength_weights, [1, 3])
@@ -89,7 +90,7 @@ def test_encodings_and_indents(tmp_path, encoding):
 
 
 def test_units(tmp_path):
-    """Lengths in inches, coefficients in their powers; never wavelengths."""
+    """Lengths are in inches, coefficients in their powers; wavelengths never are."""
     even = FRONT.replace("STANDARD", "EVENASPH") + "|PARM 1 .001|PARM 2 1e-5"
     mm, inch = read(tmp_path, even, BACK), read(tmp_path, even, BACK, UNIT="IN X")
     metres = [read(tmp_path, even, BACK, UNIT=word).lens for word in ("METER X", "M X")]
@@ -119,13 +120,14 @@ def test_types_of_surfaces(tmp_path, own, form, coefficients):
 
 
 def sags(folder, own, x, y):
-    """Heights of the first surface, of radius 50 mm, with this type and these lines."""
+    """Sags of the first surface, of radius 50 mm, with this type and these lines."""
     lens = read(folder, FRONT.replace("STANDARD", own), BACK).lens
     return float(sag(lens, 0, x, y)), lens
 
 
 def test_extra_data_are_sags_over_their_radius(tmp_path):
-    """Closed forms at x = 1, y = 2 mm with a norm radius of 4 mm; beyond the count nothing."""
+    """Closed forms at x = 1, y = 2 mm with a norm radius of 4 mm; terms beyond the count are
+    ignored."""
     x, y, radius = 1.0, 2.0, 4.0
     sphere, u = 50 - np.sqrt(50**2 - 5), np.sqrt(5) / 4
     own = "|".join(f"XDAT {k + 1} {v}" for k, v in enumerate([3, radius, 0.1, 0.2, 0.3, 9]))
@@ -143,7 +145,7 @@ def test_extra_data_are_sags_over_their_radius(tmp_path):
 
 
 def test_zernike_sag_with_powers_of_r(tmp_path):
-    """Astigmatism and coma in polar angles from x, as listings name them; powers of r beside."""
+    """Astigmatism and coma with polar angles from x, as in listings; together with powers of r."""
     own = "SZERNSAG|PARM 0 1|PARM 1 .001|PARM 3 1e-6|XDAT 1 8|XDAT 2 4|XDAT 5 .01"
     found, lens = sags(tmp_path, f"{own}|XDAT 8 .1|XDAT 10 .2", 1.0, 2.0)
     angle, u = np.arctan2(2.0, 1.0), np.sqrt(5) / 4
@@ -153,7 +155,7 @@ def test_zernike_sag_with_powers_of_r(tmp_path):
     np.testing.assert_allclose(found, wanted, rtol=1e-13)
     assert lens.forms[0] == "zernike"
     beyond = FRONT.replace("STANDARD", own.replace("PARM 0 1", "PARM 0 0"))
-    for missing in ("error", "warn"):  # what changes rays is never left out
+    for missing in ("error", "warn"):  # data that change rays are never left out
         message = refused(tmp_path, beyond, BACK, missing=missing)
         assert "Zernike terms that end at 4 mm" in message
     assert "parameter 9" in refused(tmp_path, FRONT.replace("STANDARD", own + "|PARM 9 1"), BACK)
@@ -176,7 +178,8 @@ def test_fringe_zernike_sag(tmp_path):
 
 
 def test_an_irregular_surface(tmp_path):
-    """Zs u^4 + Za v^2 + Zc u^2 v over the semi-diameter of 6 mm, decentred and tilted by itself."""
+    """Zs u^4 + Za v^2 + Zc u^2 v over the semi-diameter of 6 mm; only this surface is decentred and
+    tilted."""
     own = "IRREGULA|PARM 1 -1|PARM 2 .5|PARM 3 2|PARM 4 -3|PARM 5 .01|PARM 6 -.02|PARM 7 .03"
     found, lens = sags(tmp_path, own, 1.0, 2.0)
     u2, v = 5 / 36, 2 / 6
@@ -189,7 +192,8 @@ def test_an_irregular_surface(tmp_path):
 
 
 def test_an_even_asphere_under_another_name(tmp_path):
-    """PARM without XDAT on an XASPHERE, as some programs write it, is said; both are refused."""
+    """An XASPHERE with PARM and no XDAT, as some programs write it, is read with a warning; with
+    both it is refused."""
     lines = "|PARM 1 .001|PARM 2 1e-5|PARM 8 1e-20"
     for missing in ("error", "warn"):
         with pytest.warns(UserWarning, match="SURF 1: XASPHERE with PARM .* is an even asphere"):
@@ -202,8 +206,8 @@ def test_an_even_asphere_under_another_name(tmp_path):
 
 
 def test_forbes_aspheres(tmp_path):
-    """Q_0 of the slopes' family is 1, x (1 - x) / cos(conic); the other's first are 1, 6 x - 5 and
-    28 x^2 - 42 x + 15 times x^2."""
+    """The first Qbfs term is x (1 - x) / cos(conic) times Q_0 = 1; the first Qcon terms are x^2
+    times 1, 6 x - 5 and 28 x^2 - 42 x + 15."""
     x2 = 5 / 16
     cosine = np.sqrt(1 - 5 / 50**2)
     sphere = 50 - np.sqrt(50**2 - 5)
@@ -217,7 +221,8 @@ def test_forbes_aspheres(tmp_path):
 
 
 def test_a_phase_in_radians_focuses(tmp_path):
-    """-pi R^2 / (L f) radians over R make a plane in air a lens of the focal length f at L."""
+    """A phase of -pi R^2 / (L f) radians over R makes a plane in air a lens with the focal length f
+    at the wavelength L."""
     focal, wave, radius = 200.0, 0.55, 5.0
     strength = -np.pi * radius**2 / (wave * 1e-3 * focal)
     own = f"TYPE BINARY_2|STOP|CURV 0|PARM 0 1|XDAT 1 1|XDAT 2 {radius}|XDAT 3 {strength!r}"
@@ -231,7 +236,7 @@ def test_a_phase_in_radians_focuses(tmp_path):
 
 
 def test_surfaces_that_touch_and_fields_of_90_degrees(tmp_path):
-    """A gap of 1e-6 mm stands where there is none, where light is bent; both are said."""
+    """Touching surfaces that refract get a gap of 1e-6 mm; both are reported."""
     touching = FRONT.replace("STOP|", ""), BACK.replace("DISZ 48", "DISZ 0")
     dummy = "TYPE STANDARD|STOP|CURV 0|DISZ 0|DIAM 5 0"
     with pytest.warns(UserWarning, match="surfaces that touch stand 1e-06 mm apart: SURF 3, SURF"):
@@ -246,7 +251,8 @@ def test_surfaces_that_touch_and_fields_of_90_degrees(tmp_path):
 
 
 def test_apertures(tmp_path):
-    """Floating and fixed rings, rectangles, obscurations, their centre; the stop's is its own."""
+    """Floating and fixed rings, rectangles, obscurations, their centre; the size of the stop does
+    not follow from its ring."""
     clear = "|FLAP 0 6 0|OBDC 1 -2"
     ring = "TYPE STANDARD|CURV 0|DISZ 2|CLAP 1 5 0"
     square = "TYPE STANDARD|CURV 0|DISZ 2|SQAP 3 4 0|OBDC 0 0"
@@ -272,7 +278,8 @@ BREAK = "TYPE COORDBRK|CURV 0|PARM 1 {}|PARM 2 {}|PARM 3 {}|PARM 4 {}|PARM 5 {}|
 
 
 def test_coordinate_breaks_are_right_handed_and_have_an_order(tmp_path):
-    """Order 0 decentres, then tilts about x, y, z; order 1 with all signs turned undoes it."""
+    """Order 0 decentres, then tilts about x, y, z; order 1 with all signs reversed is the
+    inverse."""
     there = BREAK.format(1, 2, 10, 20, 30, 0, 5)
     back = BREAK.format(-1, -2, -10, -20, -30, 1, -5)
     moved = read(tmp_path, FRONT, BACK, there).lens
@@ -285,7 +292,7 @@ def test_coordinate_breaks_are_right_handed_and_have_an_order(tmp_path):
     np.testing.assert_allclose(rotation[-1], turn, atol=1e-15)
     ahead = turn @ [0, 0, 5]
     np.testing.assert_allclose([*across[-1], place[-1]], [1, 2, 52] + ahead, rtol=1e-14)
-    # Nothing is left of it once it is undone: 5 mm forward, 5 mm back in the turned frame.
+    # The inverse cancels it: 5 mm forward, 5 mm back in the rotated frame.
     undone = read(tmp_path, FRONT, BACK, there, BREAK.format(0, 0, 0, 0, 0, 0, -5), back).lens
     place, across, rotation = undone.places
     np.testing.assert_allclose(rotation[-1], np.eye(3), atol=1e-15)
@@ -294,7 +301,7 @@ def test_coordinate_breaks_are_right_handed_and_have_an_order(tmp_path):
 
 @pytest.mark.parametrize("order", [0, 1])
 def test_tilts_of_surfaces_are_coordinate_breaks(tmp_path, order):
-    """Of SCBD in front of a mirror and behind it, whatever `missing`; zeros are none."""
+    """SCBD in front of a mirror and behind it, for any `missing`; zeros are no break."""
     bare = "TYPE STANDARD|STOP|CURV 0|DISZ {}|GLAS MIRROR|DIAM 5"
     numbers = "1 2 30 -20 10"
     own = f"{bare.format(-20)}|SCBD 1 {order} 0 {numbers}|SCBD 2 {1 - order} 2 .1 0 -40 0 5"
@@ -362,7 +369,8 @@ def test_apertures_of_systems_by_their_definition(tmp_path):
 
 
 def test_a_cone_in_a_medium_is_an_angle(tmp_path):
-    """Half a cone of 30 degrees in glass: its tangent, not that of an NA of sin 30 degrees."""
+    """Half a cone of 30 degrees in glass: the tangent of this angle, not that for an NA of sin 30
+    degrees."""
     path = tmp_path / "lens.zmx"
     own = text(FRONT, BACK, ENPD=None, OBNA="30 1", object="200")
     path.write_text(own.replace("DISZ 200", "DISZ 200|GLAS N-BK7".replace("|", "\n")))
@@ -378,13 +386,14 @@ OLD = {
 
 
 def test_headers_of_older_versions(tmp_path):
-    """They are duplicates where the newer ones stand beside, wrong or not; else they are read."""
+    """Old lists are duplicates if the newer ones are present, right or wrong; otherwise they are
+    read."""
     spoilt = dict.fromkeys(OLD, "7 7") | {"WAVN": "7 7", "WWGN": "7 7"}
     new = read(tmp_path, **spoilt)
     assert not new.notes
     none = dict.fromkeys(("XFLN", "YFLN", "FWGN", "VDXN", "VDYN", "VCXN", "VCYN", "VANN"))
     path = tmp_path / "old.zmx"
-    for counts in ("0 0 2 2", "0"):  # the oldest tell no numbers of fields and wavelengths
+    for counts in ("0 0 2 2", "0"):  # the oldest have no numbers of fields and wavelengths
         own = text(FRONT, BACK, **(none | OLD | {"FTYP": counts}))
         path.write_text("\n".join(line for line in own.split("\n") if line not in WAVES))
         old = load_system(path)
@@ -412,8 +421,8 @@ def test_more_than_twelve_fields(tmp_path):
 
 
 def test_a_virtual_object_and_a_virtual_image(tmp_path):
-    """1 / s' = 1 / s + 1 / f of a thin lens: light that converges to 100 mm behind it; and a
-    sensor in front of a negative lens, which is said."""
+    """1 / s' = 1 / s + 1 / f of a thin lens: light that converges to 100 mm behind it; and a sensor
+    in front of a negative lens, which is reported."""
     lens = "TYPE STANDARD|STOP|CURV {}|DISZ 1e-3|GLAS ___BLANK 1 0 1.5 0|DIAM 5"
     back = "TYPE STANDARD|CURV 0|DISZ {}|DIAM 5"
     system = read(tmp_path, lens.format(0.02), back.format(50), object="-100")
@@ -440,7 +449,7 @@ def test_kinds_of_fields(tmp_path):
     assert scene.shape == (2,) and scene.distance == 200
     np.testing.assert_array_equal(scene.field, system.fields)
     np.testing.assert_array_equal(scene.wavelength_weights, system.wavelength_weights)
-    angled = read(tmp_path, object="200")  # seen from the entrance pupil, at the first vertex
+    angled = read(tmp_path, object="200")  # measured at the entrance pupil, at the first vertex
     np.testing.assert_allclose(np.degrees(angled.fields[1]), [1, 5])
     system = read(tmp_path, FTYP="2 0 2 2")
     focal = float(first_order(system.lens, jnp.inf, jnp.array([0.55])).focal_length[0])
@@ -479,8 +488,8 @@ def test_what_is_not_read_is_refused_by_line(tmp_path):
 
 
 def test_glasses_of_no_catalogue(tmp_path):
-    """nd and vd beside an unknown name are those of a model glass, and said; 1.5 and 40 are what
-    OpticStudio writes for none. Corning 7980, the constant N15, and air."""
+    """nd and vd given with an unknown name are those of a model glass, and are reported; 1.5 and 40
+    are OpticStudio's placeholders. Corning 7980, the constant N15, and air."""
     glass = "|GLAS N-BK7 0 0 1.5 40"
     with pytest.warns(UserWarning, match="SURF 1: no catalogue has XYZ9: nd 1.6.* vd 60.3"):
         known = read(tmp_path, FRONT.replace(glass, "|GLAS XYZ9 0 0 1.6204 60.3 0"), BACK).lens
@@ -504,7 +513,7 @@ SLIT = "|".join(
 
 
 def test_user_apertures_are_polygons(tmp_path):
-    """Their corners, in the file's unit, about the vertex or OBDC; written files are read back."""
+    """The corners are in the file's unit, about the vertex or OBDC; written files are read back."""
     front, back = f"{FRONT}|USAP 0 0 0|{SLIT}", f"{BACK}|OBDC .1 .2|{SLIT}|UDAD 4 0 0 0|USOB 0 0 0"
     lens = read(tmp_path, front, back, UNIT="CM").lens
     clips = lens.apertures
@@ -524,7 +533,7 @@ def test_user_apertures_are_polygons(tmp_path):
 
 
 def test_a_polygon_behind_a_stop_whose_rim_is_its_aperture(tmp_path):
-    """The rim is left out, the polygon stays."""
+    """The circle of the stop is left out, the polygon is kept."""
     front = FRONT.replace("DIAM 6 0", "DIAM 5 0|FLAP 0 5 0")
     clips = read(tmp_path, front, f"{BACK}|USAP 0 0 0|{SLIT}").lens.apertures
     assert clips.kinds == ("polygon",) and clips.surfaces == (1,)
@@ -560,7 +569,8 @@ def test_what_is_read_otherwise_is_said(tmp_path):
 
 
 def test_model_glasses_without_dispersion_and_with(tmp_path):
-    """Vd 0 is a constant index; nd and vd as OpticStudio's listing of 1.511, 60.6 at 0.55 um."""
+    """Vd = 0 is a constant index; nd and vd agree with OpticStudio's listing of 1.511, 60.6 at 0.55
+    um."""
     constant = read(tmp_path, FRONT.replace("N-BK7 0 0 1.5 40", "___BLANK 1 0 1.6 0"), BACK).lens
     np.testing.assert_array_equal(constant.index([0.45, 0.7])[1], [1.6, 1.6])
     model = read(tmp_path, FRONT.replace("N-BK7 0 0 1.5 40", "___BLANK 1 0 1.511 60.6 0"), BACK)
@@ -588,7 +598,8 @@ SENSOR = {"sensor_tilt": [1, 0.5, 0], "sensor_decentre": [0.2, 0.1]}
 
 
 def assert_same(one, two):
-    """Two lenses, but for their names, to the last bit; model glasses to the last digits of nd."""
+    """Asserts that two lenses agree to the last bit, except their names; model glasses to the last
+    digits of nd."""
     for key in ("curvature", "conic", "thickness", "semi_diameter", "sensor"):
         np.testing.assert_array_max_ulp(np.asarray(getattr(one, key)), getattr(two, key), 1)
     width = one.coefficients.shape[1]
@@ -605,7 +616,7 @@ def test_written_and_read_back(tmp_path, name):
     lens = load_lens(name)
     save_lens(lens, tmp_path / "lens.zmx")
     assert_same(lens, load_lens(tmp_path / "lens.zmx"))
-    # What others fall back on that do not know a glass: nd and vd; and no glass of the name air.
+    # nd and vd, for programs that do not know a glass; and no glass with the name air.
     said = re.findall(r"GLAS (?!MIRROR)\S+ \d 0 (\S+) (\S+)", (tmp_path / "lens.zmx").read_text())
     known = np.asarray(nd_and_vd(lens.dispersion))
     glass = known[:-1][known[:-1, 1] > 0]
@@ -633,8 +644,8 @@ def read_back(tmp_path, lens):
 
 @pytest.mark.slow
 def test_written_breaks(tmp_path):
-    """Breaks that move all that follows, with their numbers; elements that end, and decentres and
-    tilts of single surfaces, to rounding: the same places, and rays through them."""
+    """Breaks that move all surfaces behind them have the same numbers. Elements that end, and
+    decentres and tilts of single surfaces, have the same positions and rays to rounding."""
     turns = [BREAK.format(0, 1, 2, -3, 0.7, 0, 5), BREAK.format(0.5, 0, 0, 20, 3, 0, -2)]
     lens = read(tmp_path, FRONT, BACK, *turns, FRONT.replace("STOP|", "")).lens
     again = read_back(tmp_path, lens)
@@ -644,7 +655,7 @@ def test_written_breaks(tmp_path):
     lens = load_lens({"surfaces": CROOKED, "elements": MOVED, "sensor": 4.0, **SENSOR})
     again = read_back(tmp_path, lens)
     (z, *others), (along, *found) = lens.places, again.places
-    # The file begins at an object at infinity: it does not tell how far the first element moved.
+    # The object is at infinity: the file does not contain the shift of the first element along z.
     np.testing.assert_allclose(z - z[0], along - along[0], rtol=0, atol=1e-13)
     for one, two in zip(others, found, strict=True):
         np.testing.assert_allclose(one, two, rtol=0, atol=1e-14)
@@ -659,7 +670,7 @@ def test_written_breaks(tmp_path):
 
 @pytest.mark.parametrize("name", ["czt_spect", "schlieren_system"])
 def test_files_with_breaks_are_written_as_they_were(tmp_path, shared, name):
-    with pytest.warns(UserWarning, match="pickups are read as the values"):
+    with pytest.warns(UserWarning, match="pickups are read as their"):
         lens = load_lens(shared / "lens_files" / f"{name}.zmx")
     again = read_back(tmp_path, lens)
     assert_same(lens, again)
@@ -668,7 +679,8 @@ def test_files_with_breaks_are_written_as_they_were(tmp_path, shared, name):
 
 
 def test_written_series_and_phases(tmp_path):
-    """Extra data and radial phases, read back; and a sag that does not come from this reader."""
+    """Extra data and radial phases are read back; and a sag that is computed without this
+    reader."""
     series = "XDAT 1 3|XDAT 2 4|XDAT 3 {0}|XDAT 4 -.2|XDAT 5 .3"
     kinds = [f"{kind}|{series.format(0.1)}" for kind in ("XPOLYNOM", "SZERNSAG|PARM 0 1")]
     kinds.append("XASPHERE|XDAT 1 9|XDAT 2 20|XDAT 4 .1|XDAT 11 .2")
@@ -704,7 +716,7 @@ def test_files_that_are_none(tmp_path):
         assert time.process_time() - began < 2
         assert str(path) in str(error.value) and "\n" not in str(error.value)
         assert len(str(error.value)) <= 300
-    for _ in range(150):  # a few bytes changed: refused in a line, or a lens
+    for _ in range(150):  # some bytes changed: an error of one line, or a lens
         own = bytearray(text(FRONT, BACK).encode())
         for place in noise.integers(0, len(own), 4):
             own[place] = noise.integers(0, 256)
@@ -730,7 +742,7 @@ def listed(content, key):
     return float(word), step
 
 
-# Of the 28, those whose glasses we have.
+# Those of the 28 whose glasses we have.
 READ = (
     *("10281683", "1792917", "1843519", "2453260", "2645156", "528155", "5852515a", "6744570a"),
     *("7558005a", "7643216a", "7821720a", "7821720b", "895045a", "Dyson1959", "WIYN"),
@@ -752,7 +764,8 @@ OPERANDS = (
 
 
 def test_each_configuration_is_read(tmp_path):
-    """The numbers of the rows in place of those beside; the current one as it stands there."""
+    """The numbers of the rows replace those of the surfaces; the current configuration has those of
+    the surfaces."""
     tail = ("MNUM 2 1", *rows(*OPERANDS))
     with pytest.warns(UserWarning, match="of 2 configurations number 1; give `configuration`"):
         beside = read(tmp_path, tail=tail, UNIT="MM")
@@ -797,7 +810,7 @@ def test_rows_that_are_not_known_are_refused_where_they_differ(tmp_path):
 
 
 def wild(name, configuration):
-    """A file from elsewhere, and its first-order data at its primary wavelength."""
+    """A file from a public repository, and its first-order data at its primary wavelength."""
     (path,) = (SHARED.parent / "wild").glob(f"{name}*.zmx")
     system = load_system(path, "warn", configuration)
     return system, first_order(
@@ -814,7 +827,8 @@ def wild(name, configuration):
     ],
 )
 def test_zooms_of_patents_are_in_focus_in_every_configuration(name, focal):
-    """Focal lengths of the patents, mm; the file's sensor lies in the paraxial focus of each."""
+    """Focal lengths of the patents, mm; in each configuration the sensor is in the paraxial
+    focus."""
     for k, wanted in enumerate(focal):
         system, found = wild(name, k + 1)
         np.testing.assert_allclose(found.effective_focal_length, wanted, atol=6e-3)
@@ -832,7 +846,7 @@ def test_a_macro_lens_of_a_patent_has_its_magnifications():
 @LISTED
 @pytest.mark.parametrize("name", READ)
 def test_listed_first_order(name):
-    """Focal length, pupil and f-number to the listing's last digit, indices to 2e-10."""
+    """Focal length, pupil and f-number agree to the listing's last digit, indices to 2e-10."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         system = load_system(SHARED / f"{name}.zmx")

@@ -1,4 +1,5 @@
-"""Afocal lenses: angles for heights, a plane for the sphere; and light that arrives collimated."""
+"""Afocal lenses: angles instead of heights, a plane instead of the reference sphere; and sensors in
+collimated light."""
 
 import dataclasses
 
@@ -33,8 +34,9 @@ PINHOLE = {
 
 @pytest.mark.slow
 def test_the_wavefront_of_a_mersenne_telescope():
-    """Light of the angle a leaves as from an image surface of Petzval's curvature, with the
-    vergence a^2 / 2 times it; its edge is ahead of the plane by half of that times the radius^2."""
+    """Light at the angle a leaves as from an image surface with Petzval's curvature, with that
+    curvature times a^2 / 2 as vergence; at the edge the wavefront is ahead of the plane by half of
+    the vergence times the squared radius."""
     points = [[0.0, 1.0], [1.0, 0.0], [0.0, -1.0], [0.6, 0.0]]
     found = drt_jax.wavefront(LENS, Scene.point(FIELD, np.inf, WAVE), points)
     vergence = (POWER * FIELD) ** 2 * PETZVAL / 2
@@ -49,7 +51,8 @@ def test_the_wavefront_of_a_mersenne_telescope():
 
 @pytest.mark.slow
 def test_spots_chief_rays_and_foci_of_a_telescope():
-    """mrad, and for foci 1e-3 dioptre; a ray's angle differs by the vergence times its height."""
+    """In mrad, and foci in 1e-3 dioptre; the angle of a ray differs by the vergence times its
+    height."""
     spots = drt_jax.spot_diagram(LENS, Scene.radians([0.0, FIELD], np.inf, WAVE), sampling=RULE)
     vergence = (POWER * FIELD) ** 2 * PETZVAL / 2
     blur = 1e3 * vergence * EXIT / np.sqrt(2)
@@ -70,7 +73,7 @@ def test_spots_chief_rays_and_foci_of_a_telescope():
 
 @pytest.mark.slow
 def test_contrast_of_a_telescope_is_that_of_its_exit_pupil():
-    """Cycles a mrad up to the width of the beam over the wavelength."""
+    """In cycles/mrad, up to the width of the beam divided by the wavelength."""
     parts = np.array([0.0, 0.2, 0.5, 0.8])
     lines = parts * 2 * EXIT / WAVE
     found = drt_jax.transfer(
@@ -96,8 +99,8 @@ def test_an_afocal_lens_has_no_focus(tmp_path):
 
 @pytest.mark.slow
 def test_collimated_light_on_a_sensor():
-    """A pinhole: light without a lens is out of focus by a^2 / (2 R) of the sphere about the
-    sensor, and its irradiance that of Fresnel's zones; one object point has no cone of light."""
+    """A pinhole: light without a lens has the defocus a^2 / (2 R) relative to the sphere about the
+    sensor, and the irradiance of Fresnel's zones. One object point has no cone of light."""
     lens, zones = load_lens(PINHOLE), 0.5**2 / (200 * WAVE * 1e-3)
     ratio = drt_jax.strehl(
         lens, Scene.radians([0.0], np.inf, WAVE), sampling=drt_jax.Sampling.of("waves", RULE, 64)
@@ -109,7 +112,7 @@ def test_collimated_light_on_a_sensor():
 
 
 def test_the_focal_length_of_an_afocal_lens_is_infinite():
-    """To rounding, which is not a power."""
+    """A power within rounding counts as 0."""
     for gap in (-75.0, -74.999):
         surfaces = [TELESCOPE["surfaces"][0] | {"thickness": gap}, TELESCOPE["surfaces"][1]]
         found = drt_jax.first_order(load_lens({"surfaces": surfaces}), np.inf, WAVE)

@@ -1,5 +1,5 @@
-"""Chief rays over the field: closed forms, the complex step on an independent trace, figures of
-other programs, derivatives by lens numbers."""
+"""Chief rays over the field, compared with closed forms, the complex step on an independent trace,
+and numbers of other programs; derivatives by lens numbers."""
 
 import dataclasses
 
@@ -41,7 +41,7 @@ COOKE = load_lens("cooke_triplet")
 
 
 def moved(lens):
-    """Tilted and decentred, without any symmetry."""
+    """A tilted and decentred lens without any symmetry."""
     rows = lens.count + 1
     shift = 0.2 * np.sin(np.arange(2 * rows)).reshape(rows, 2)
     tilt = 0.02 * np.cos(np.arange(3 * rows)).reshape(rows, 3)
@@ -50,8 +50,8 @@ def moved(lens):
 
 @pytest.mark.slow
 def test_a_ball_with_the_stop_at_its_centre():
-    """Chief rays are straight, so that y = L tan(field); both foci lie at n R / (2 (n - 1)) from
-    the centre, on a sphere about it; the angle on the sensor is that of the field."""
+    """Chief rays are straight, so that y = L tan(field). Both foci are at the distance n R / (2 (n
+    - 1)) from the centre, on a sphere about it. The angle on the sensor is that of the field."""
     lens, angles = load_lens(BALL), np.array([0.0, 0.2, 0.5, 1.0])
     found = drt_jax.distortion(lens, Scene.radians(angles, np.inf, WAVES))
     np.testing.assert_allclose(found.relative, 0, atol=1e-13)
@@ -103,8 +103,8 @@ def test_a_symmetric_lens_at_unit_magnification_has_no_distortion_and_no_lateral
 @pytest.mark.parametrize("lens", [COOKE, moved(COOKE)], ids=["centred", "moved"])
 @pytest.mark.parametrize("distance", [np.inf, 900.0])
 def test_foci_and_heights_by_the_complex_step(lens, distance):
-    """On a trace that shares nothing: h + s m as a function of the stop point is singular at both
-    foci, and its kernel is nearer to the direction of the field at the tangential one."""
+    """On an independent trace, h + s m as a function of the stop point is singular at both foci; at
+    the tangential one its kernel is closer to the direction of the field."""
     found = drt_jax.field_curvature(lens, Scene.radians(FIELDS, distance, WAVES))
     bent = drt_jax.distortion(lens, Scene.radians(FIELDS, distance, WAVES))
     for k, field in enumerate(FIELDS):
@@ -137,8 +137,8 @@ def test_foci_and_heights_by_the_complex_step(lens, distance):
 
 @pytest.mark.slow
 def test_small_fields_by_petzval():
-    """(3 sagittal - tangential) / 2 is the sag of the Petzval surface (Welford, ch. 8), to the
-    square of the field."""
+    """(3 sagittal - tangential) / 2 is the sag of the Petzval surface (Welford, ch. 8), to second
+    order in the field."""
     focus = drt_jax.first_order(COOKE, np.inf, WAVES[1]).image_distance[0]
     lens = dataclasses.replace(COOKE, sensor=focus)
     first = drt_jax.first_order(lens, np.inf, WAVES[1])
@@ -182,7 +182,7 @@ def slopes(lens, fields):
 
 @pytest.mark.slow
 def test_derivatives_by_lens_numbers():
-    """Reverse mode against central differences."""
+    """Reverse mode compared with central differences."""
     fields = jnp.array([[0.05, 0.2], [0.0, 0.1], [-0.1, 0.0]])
     steps = {"curvature": 1e-7, "thickness": 1e-5, "sensor": 1e-5}
     check_slopes(lambda lens: slopes(lens, fields), COOKE, steps, 2e-6)
@@ -190,7 +190,7 @@ def test_derivatives_by_lens_numbers():
 
 @pytest.mark.slow
 def test_a_field_without_a_chief_ray_is_infinite_and_spoils_no_other():
-    """Light of 2 rad comes from behind."""
+    """A field of 2 rad is light from behind."""
     (_, found), slope = slopes(COOKE, jnp.array([[0.0, 0.1], [0.0, 1.55], [0.0, 2.0]]))
     for part in found:
         assert np.all(np.isfinite(part[0])) and np.all(np.isposinf(part[2]))
@@ -200,9 +200,9 @@ def test_a_field_without_a_chief_ray_is_infinite_and_spoils_no_other():
 
 @pytest.mark.slow
 def test_the_distortion_focal_length_of_opticstudio():
-    """Double Gauss 28 degree field, 0.5876 um, not aimed at the stop: the height of the chief ray
-    at Hy = 1e-4 of 14 degrees gives 99.3320630 mm ("Distortion Focal Length", Zemax Community,
-    2022), as the listing of the distortion plot does."""
+    """Double Gauss 28 degree field, 0.5876 um, without ray aiming: the height of the chief ray at
+    Hy = 1e-4 of 14 degrees gives 99.3320630 mm ("Distortion Focal Length", Zemax Community, 2022),
+    as in the listing of the distortion plot."""
     lens = drt_jax.with_paraxial_pupil(load_lens("double_gauss"), 0.5876)
     lens = dataclasses.replace(lens, sensor=lens.vertices[-2] + 57.314537905)
     found = drt_jax.distortion(lens, Scene.radians(np.radians(14.0), np.inf, 0.5876))
@@ -211,7 +211,7 @@ def test_the_distortion_focal_length_of_opticstudio():
 
 @pytest.mark.slow
 def test_a_chief_ray_in_a_stop_at_the_first_vertex_is_found():
-    """Of a bundle of one ray the search took steps of no size there, and lost it."""
+    """For a bundle of this ray alone, the steps of the search were 0, and the ray was not found."""
     lens = load_lens("phone")
     wanted = drt_jax.trace_rays(lens, Scene.point(0.05, np.inf, 0.53), [[0.0, 0.0], [0.0, 1.0]])
     point = drt_jax.image_point(lens, Scene.point(0.05, np.inf, 0.53))

@@ -1,4 +1,5 @@
-"""Moments over depth: interpolation against tracing, and the cheapest model for what is trained."""
+"""Moments over depth: interpolation compared with tracing, and the cheapest model for the trained
+numbers."""
 
 import dataclasses
 
@@ -30,7 +31,7 @@ def test_depth_interpolation_is_the_traced_moment(field):
 
 @pytest.mark.slow
 def test_gradient_of_the_depth_interpolation_is_the_traced_one():
-    """By the distance and the sensor position, 1e-10 of the largest over the range."""
+    """By the distance and the sensor position, within 1e-10 of the largest value over the range."""
     depths = depth_moments(LENS, Scene.point(0.05, (5e3, 5e4), RGB[:2]), 1e-13)
     rule = Gauss(16, "bilateral")
 
@@ -63,7 +64,7 @@ def test_cheapest_model_agrees_with_retracing():
         for a, b in zip(*map(jax.tree.leaves, found), strict=True):
             np.testing.assert_allclose(a, b, rtol=1e-8, atol=1e-14)
         assert found[0].separable and found[1].separable
-    # In the cheap one no ray is traced: no loop, no square root of a root-finder.
+    # The cheap model traces no ray: it has no loop, and no square root of a root finder.
     assert "while" not in str(jax.make_jaxpr(cheap)(values, 2e4))
     assert "while" in str(jax.make_jaxpr(retrace)(everything, 2e4))
 

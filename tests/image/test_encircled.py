@@ -1,4 +1,4 @@
-"""Encircled energy against closed forms and counted rays."""
+"""Encircled energy compared with closed forms and counted rays."""
 
 import dataclasses
 
@@ -20,7 +20,7 @@ ZEROS = np.array([1.2196698912665045, 2.2331306]) * WAVE * 1e-3 / (2 * APERTURE)
 
 @pytest.mark.slow
 def test_airys_pattern():
-    """P10, and 1 - J0^2 - J1^2 elsewhere."""
+    """P10, and 1 - J0^2 - J1^2 at other radii."""
     some = np.linspace(0, 6e-2, 7)
     radii = np.concatenate([ZEROS, some])
     found = np.asarray(
@@ -34,7 +34,8 @@ def test_airys_pattern():
 
 @pytest.mark.slow
 def test_an_even_disc_of_rays():
-    """The paraboloid out of focus: a ray of height h is at d h / (f - h^2 / (4 f)), f = 100."""
+    """For the paraboloid out of focus, a ray of the height h is at d h / (f - h^2 / (4 f)), f =
+    100."""
     step, f = 1.0, 100.0
     place = lambda h: step * h / (f - h**2 / (4 * f))  # noqa: E731
     heights = np.array([0.0, 0.1, 0.3, 0.5, 0.8, 0.95, 1.1, 3.0])

@@ -1,4 +1,4 @@
-"""Fans of rays, and foci by colour."""
+"""Ray fans, and foci by wavelength."""
 
 import dataclasses
 
@@ -31,7 +31,7 @@ FAN_UM = [
 
 @pytest.mark.slow
 def test_the_fan_that_opticstudio_prints():
-    """To the last of its digits; odd in Py, and the same across."""
+    """To its last digit; odd in Py, and the same along x."""
     found = drt_jax.ray_fans(load_lens(P01), Scene.radians([0.0], np.inf, 0.543), 21)
     assert found.pupil.shape == (21,) and found.tangential.shape == (1, 1, 21, 2)
     wanted = np.array([*(-a for a in FAN_UM[:0:-1]), *FAN_UM])
@@ -62,8 +62,8 @@ def test_fans_are_rays_and_wavefronts(fields):
 
 @pytest.mark.slow
 def test_foci_of_rays_by_colour():
-    """The triplet's rays cross the axis where `trace_rays` has them, near it at the paraxial
-    focus."""
+    """The rays of the triplet cross the axis where those of `trace_rays` do; rays close to the axis
+    at the paraxial focus."""
     found = drt_jax.axial_colour(COOKE, Scene.point(0.0, np.inf, WAVES), [1e-3, 0.7, 1.0])
     wanted = drt_jax.first_order(COOKE, np.inf, WAVES).image_distance - COOKE.sensor
     np.testing.assert_allclose(found.paraxial, wanted, rtol=1e-12)
@@ -75,8 +75,8 @@ def test_foci_of_rays_by_colour():
 
 @pytest.mark.slow
 def test_derivatives_and_failed_rays():
-    """Rays beyond the edge of a surface are infinite, and have no derivative; others have that of
-    their differences."""
+    """Rays beyond the edge of a surface are infinite, and have derivatives of 0; the derivatives of
+    others agree with differences."""
     lens = dataclasses.replace(COOKE, semi_diameter=COOKE.semi_diameter.at[0].set(5.0))
 
     @jax.jit

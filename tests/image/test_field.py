@@ -50,7 +50,7 @@ def test_clear_errors():
 
 @pytest.mark.slow
 def test_a_field_is_found_where_rounding_stops_newton():
-    """At 21.6 mm of this zoom no step came below the tolerance, and the field was called inf."""
+    """At 21.6 mm of this zoom no step was below the tolerance, and the field was inf."""
     path = pathlib.Path(__file__).resolve().parents[2] / "configs/design/lenses/us5568323.zmx"
     lens = drt_jax.load_lens(path, configuration=2)
     for height in np.linspace(21.5, 21.7, 9):

@@ -1,4 +1,4 @@
-"""Kernels against the integral of the Gaussian over each pixel, by adaptive quadrature."""
+"""Kernels compared with the integral of the Gaussian over each pixel, by adaptive quadrature."""
 
 import jax
 import jax.numpy as jnp
@@ -67,7 +67,8 @@ def test_equation_5_as_printed():
 
 
 def test_energy_of_the_printed_form_is_lost_or_made_up():
-    """Why it is not the default: 11 % of the light at sigma 24 px, more than all at 0.3 px."""
+    """The reason why it is not the default: the sum is 0.11 at sigma 24 px, and above 1 at 0.3
+    px."""
     energy = [
         float(jnp.sum(gaussian_psf(jnp.zeros((1, 2)), s**2 * jnp.eye(2)[None], 1.0, 21, "sampled")))
         for s in (24.0, 0.3)
@@ -111,7 +112,8 @@ def test_finite_from_a_point_to_any_width(form, dense, dtype):
     ],
 )
 def test_an_infinite_blur_is_black_and_has_no_slope(form, psf, failed):
-    """What moments inside a trace say of a colour that passes no ray; the others do not notice."""
+    """Moments inside a trace have an infinite covariance for a wavelength without rays; kernels of
+    others do not change."""
     failed = jnp.array(failed)
     xy = 0.0 if psf is kernels.separable_psf else 1.0
     seen = jnp.array([[4.0, xy], [xy, 2.0]])
@@ -190,8 +192,8 @@ def test_a_pixel_that_looks_like_micrometres_is_warned_of():
 @pytest.mark.parametrize("form", ["integrated", "sampled"])
 @pytest.mark.parametrize("dense", [False, True])
 def test_no_numbers_make_a_nan(form, dense):
-    """Inside a trace what is no number, or no pixel, is black, and all else finite: values and
-    derivatives, in float64 and float32."""
+    """Inside a trace, kernels of NaN or of an invalid pixel are 0, and all others are finite:
+    values and derivatives, in float64 and float32."""
 
     def kernel(mean, covariance, pixel):
         psf = kernels.gaussian_psf if dense else kernels.separable_psf

@@ -1,4 +1,4 @@
-"""One call, one meaning: the same numbers eagerly and inside `jax.jit`; what fails looks bad."""
+"""A call gives the same numbers outside of `jax.jit` and inside; failures give bad results."""
 
 import dataclasses
 
@@ -52,7 +52,7 @@ CLIPPED = pytest.param("double_gauss", np.radians(14), np.inf, marks=pytest.mark
 @pytest.mark.slow
 @pytest.mark.parametrize("name, field, distance", [("singlet", 0.0, 1e4), CLIPPED])
 def test_eager_and_compiled_agree(name, field, distance):
-    """Moments to 1e-12 and the gradient of the variances to 1e-10, at the default tolerance: an
+    """Moments to 1e-12 and the gradient of the variances to 1e-10, at the default tolerance. An
     eager gradient knows its numbers and needs no rule."""
     lens, colours = load_lens(name), (0.6, 0.48)
     if name == "double_gauss":
@@ -77,8 +77,8 @@ def test_eager_and_compiled_agree(name, field, distance):
 
 @pytest.mark.slow
 def test_a_lens_that_passes_no_ray(singlet):
-    """An error outside; inside, a variance of inf, nothing passed and derivatives of 0."""
-    scene = (1.5, np.inf, (0.6, 0.48))  # all light passes beside the lens
+    """An error outside; inside, a variance of inf, a throughput of 0 and derivatives of 0."""
+    scene = (1.5, np.inf, (0.6, 0.48))  # all rays miss the lens
     with pytest.raises(ValueError, match="no ray at .*: 100% misses surface 1"):
         psf_moments(singlet, Scene.point(*scene))
     with pytest.raises(ValueError, match="no ray at .*: 100% misses surface 1"):
@@ -91,7 +91,8 @@ def test_a_lens_that_passes_no_ray(singlet):
 
 @pytest.mark.slow
 def test_a_wavelength_without_an_index(singlet):
-    """An error outside; inside, that colour looks as bad as can be, and moves no other."""
+    """An error outside; inside, this wavelength has the worst result, and does not change
+    others."""
     for call in (psf_moments, converged_rule):
         with pytest.raises(ValueError, match=r"0\.1 um is outside the range"):
             call(singlet, Scene.point(*SCENE[:2], (0.6, 0.1)))
@@ -107,7 +108,7 @@ def test_a_wavelength_without_an_index(singlet):
 
 @pytest.mark.slow
 def test_rays_mean_the_same_inside(singlet):
-    """Points, path and status of rays that arrive, are clipped and miss; and of no index."""
+    """Points, path and status of rays that arrive, are clipped, miss, or have no index."""
     lens = dataclasses.replace(singlet, semi_diameter=singlet.semi_diameter.at[1].set(4.0))
     pupil = np.stack(np.meshgrid([0.0], np.linspace(-3, 3, 13)), -1).reshape(-1, 2)
 

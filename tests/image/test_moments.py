@@ -1,4 +1,5 @@
-"""Moments: published numbers, symmetric against general paths, polynomials against tracing."""
+"""Moments: published numbers, symmetric paths compared with general ones, polynomials compared with
+tracing."""
 
 import dataclasses
 import functools
@@ -27,8 +28,8 @@ from ..conftest import RGB, assert_close
 from ..known import freed, known, search
 
 FAR = 25000.0
-# All fast tests are about one lens: its programs, for one radius, half a pupil and all of it, are
-# those of every call that converges.
+# All fast tests use one lens: its programs, for one radius, half a pupil and the whole pupil, serve
+# all calls with a tolerance.
 LENS = freed(load_lens("double_gauss"))
 # Double Gauss, object at 25 m, mean of R, G, B, in um, found before this package was written.
 SIGMA = {
@@ -60,7 +61,7 @@ def test_blur_of_the_double_gauss(sensor):
 
 
 def test_meridional_half_and_whole_pupil_agree():
-    """On the axis and so little beside it that nothing changes."""
+    """On the axis, and so close to it that nothing changes."""
     lens = at(133.0)
     meridian = psf_moments(lens, Scene.point(0.0, FAR, RGB), 1e-11)
     for field in (1e-14, (1e-14, 0.0)):
@@ -93,7 +94,7 @@ def test_gradients_of_meridional_half_and_whole_pupil_agree():
         lens, distance = moved
         scene = checked_scene(lens, Scene.point(field, distance, RGB[:2]))
         traced = moments(lens, scene, Gauss(wide, symmetry))
-        # On axis the centroid is 0, and the gradient of what rounding leaves of it is no number.
+        # On axis the centroid is 0, and the gradient of its rounding error is meaningless.
         return jnp.sum(weights * traced.spread[..., :2]) + field * jnp.sum(traced.mean[:, 1])
 
     for field in (0.0, 0.1):
@@ -119,7 +120,7 @@ def slopes(lens, distance, found):
 
 @pytest.mark.slow
 def test_a_centred_lens_given_zero_tilts_and_decentres_is_the_same():
-    """Moments and their gradients by everything that both have, 1e-10."""
+    """Moments and their gradients by all numbers that both have, to 1e-10."""
     rows = LENS.count + 1
     given = dataclasses.replace(LENS, decentre=jnp.zeros((rows, 2)), tilt=jnp.zeros((rows, 3)))
     distance = jnp.asarray(9000.0)
@@ -135,7 +136,7 @@ def test_a_centred_lens_given_zero_tilts_and_decentres_is_the_same():
 
 @pytest.mark.slow
 def test_moments_are_those_of_many_random_rays():
-    """The paper's way, with 40,000 rays instead of 256: agrees within 4 standard errors."""
+    """As in the paper, with 40,000 rays instead of 256: they agree within 4 standard errors."""
     lens = load_lens("cooke_triplet")
     points, _ = pupil.random_disc(40_000, seed=0)
     hits = np.asarray(
@@ -158,15 +159,15 @@ def test_sensor_polynomial_is_the_traced_moment(field):
     for sensor in (130.0, 133.0, 133.35, 135.0):
         moments = psf_moments(at(sensor), Scene.point(field, FAR, RGB), 1e-9)
         found = focus.at(sensor)
-        assert found.separable and found.covariance.shape == (3, 2, 2)  # axes by symmetry
+        assert found.separable and found.covariance.shape == (3, 2, 2)  # diagonal by symmetry
         np.testing.assert_allclose(found.mean, moments.mean, atol=1e-10)
         np.testing.assert_allclose(found.covariance, moments.covariance, rtol=2e-9, atol=1e-13)
 
 
 @pytest.mark.slow
 def test_gradient_of_the_sensor_polynomial_is_the_traced_one():
-    """By the whole lens, the distance and the sensor position, 1e-10; 2.5 mm from the sensor
-    about which the polynomial was made."""
+    """By the whole lens, the distance and the sensor position, to 1e-10; 2.5 mm from the sensor
+    position about which the polynomial was made."""
     scene, rule = (LENS, FAR, jnp.array(131.0)), Gauss(4, "bilateral")
 
     def polynomial(lens, distance, sensor):
@@ -181,9 +182,9 @@ def test_gradient_of_the_sensor_polynomial_is_the_traced_one():
 
     ours = jax.jit(jax.grad(polynomial, argnums=(0, 1, 2)))(*scene)
     wanted = jax.jit(jax.grad(traced, argnums=(0, 1, 2)))(*scene)
-    # The position of the sensor is its own argument: the lens's sensor only sets the origin.
+    # The position of the sensor is an argument: the lens's sensor only sets the origin.
     assert abs(ours[0].sensor) < 1e-10 * abs(ours[2]) and wanted[0].sensor == 0
-    # And the polynomial is that of a flat sensor: how it bends counts at its own place.
+    # The polynomial is that of a flat sensor; a curved sensor counts at its own position.
     last = {k: getattr(wanted[0], k)[-1] for k in ("curvature", "conic", "coefficients")}
     bent = {k: getattr(ours[0], k).at[-1].set(v) for k, v in last.items()}
     ours = dataclasses.replace(ours[0], sensor=wanted[0].sensor, **bent), *ours[1:]
@@ -206,8 +207,8 @@ def test_a_rule_keeps_the_promised_tolerance(degrees):
 
 @pytest.mark.slow
 def test_one_rule_serves_many_fields_and_distances():
-    """It keeps the tolerance of each, has the order that the hardest needs, and the symmetry of
-    all."""
+    """It keeps the tolerance of each, and has the order that the most difficult needs and the
+    symmetry of all."""
     fields, distances = [[0.0, 0.0], [0.0, np.radians(10)]], (FAR, 5000.0)
     rule = converged_rule(LENS, Scene.grid(fields, distances, RGB), 1e-6)
     assert rule.symmetry == "bilateral" and symmetry_of(LENS, [*fields, [0.1, 0.0]]) == "none"
@@ -240,7 +241,7 @@ def test_tolerance_holds_at_any_sensor_position():
 
 @pytest.mark.slow
 def test_slow_convergence_is_said():
-    """Where light is reflected totally, no aperture ends the beam."""
+    """The beam ends at total internal reflection, not at an aperture."""
     faces = [
         {"radius": "inf", "thickness": 8.0, "glass": "N-BK7", "semi_diameter": 10.0, "stop": True},
         {"radius": -12.0},
@@ -248,7 +249,7 @@ def test_slow_convergence_is_said():
     ball = load_lens({"surfaces": faces, "sensor": 30.0})
     with pytest.warns(UserWarning, match="converged to .* only.* does the edge of the beam fail"):
         found = psf_moments(ball, Scene.point(0.0, np.inf, 0.55), 1e-9)
-    edge = 12 / ball.index(np.array([0.55]))[1]  # where the angle of incidence is the critical one
+    edge = 12 / ball.index(np.array([0.55]))[1]  # at the critical angle of incidence
     np.testing.assert_allclose(found.throughput, (edge / 10) ** 2, rtol=0.05)
 
 
@@ -264,7 +265,7 @@ def test_inside_a_trace_the_rule_must_be_given():
 
 @pytest.mark.parametrize("symmetry, field", [("rotational", 0.05), ("bilateral", (0.05, 0.05))])
 def test_a_rule_of_a_part_of_the_pupil_is_not_used_where_it_does_not_stand_for_all(symmetry, field):
-    """A ValueError where the field is known; no light where it is not."""
+    """A ValueError if the field is known; otherwise a throughput of 0."""
     rule = drt_jax.Gauss(2, symmetry)
     with pytest.raises(ValueError, match="the rule is made for"):
         psf_moments(LENS, Scene.point(field, FAR, RGB), sampling=rule)
@@ -279,7 +280,7 @@ def at_traced(sensor):
 
 
 def size(lens, sampling):
-    """Spot size of green in um, and what passes; by the call of the README."""
+    """Spot size of the green wavelength in um, and throughput; by the call of the README."""
     found = psf_moments(lens, Scene.point(0.0, FAR, RGB), sampling)
     return 1e3 * jnp.sqrt(found.covariance[1, 0, 0]), found
 
@@ -292,7 +293,7 @@ def test_an_eager_gradient_is_that_of_a_program_and_of_differences():
     (value, _), inside = whole(lens, rule)
     (other, _), eager = jax.value_and_grad(lambda lens: size(lens, 1e-9), has_aux=True)(lens)
     np.testing.assert_allclose(value, other, rtol=1e-9)
-    assert_close(eager, inside, 1e-7, 1e-9)  # another rule, that the tolerance was found with
+    assert_close(eager, inside, 1e-7, 1e-9)  # another rule, from the tolerance
     for leaf, k in (("curvature", 2), ("thickness", 5), ("conic", 6), ("semi_diameter", 5)):
         h = 1e-5 * (abs(float(getattr(lens, leaf)[k])) + 1e-2)
         shift = lambda s: dataclasses.replace(  # noqa: E731
@@ -304,7 +305,8 @@ def test_an_eager_gradient_is_that_of_a_program_and_of_differences():
 
 @pytest.mark.slow
 def test_no_failing_lens_looks_good():
-    """Eagerly an error; inside a trace passed = 0, the covariance inf, no derivatives."""
+    """Outside of a trace an error; inside, throughput = 0, an infinite covariance, and derivatives
+    of 0."""
     rule = converged_rule(at(133.0), Scene.point(0.0, FAR, RGB), 1e-9)
     blocked = dataclasses.replace(LENS, semi_diameter=LENS.semi_diameter.at[0].set(1e-3))
     with pytest.raises(ValueError, match="no ray at 0.6 um reaches the sensor"):
@@ -325,7 +327,7 @@ def test_bad_requests():
 
 
 def test_a_lens_fixed_inside_jit_is_a_known_scene():
-    """Its rule is found, and nothing of a closed-over lens is traced into the program."""
+    """Its rule is found, and the search for it is no part of the program."""
     lens = at(133.0)
     scaled = jax.jit(lambda s: s * psf_moments(lens, Scene.point(0.0, FAR, RGB), 1e-9).covariance)
     assert "while" not in str(jax.make_jaxpr(scaled)(1.0))

@@ -1,5 +1,5 @@
-"""Kernels of the three models against sums that nobody here shares: histograms of traced rays,
-direct sums of plane waves, closed forms; and their derivatives against differences."""
+"""Kernels of the three models compared with independent sums: histograms of traced rays, direct
+sums of plane waves, closed forms; and their derivatives compared with differences."""
 
 import dataclasses
 import re
@@ -38,7 +38,7 @@ FIELD = np.radians(14.0)
 
 
 def histogram(rays, weights, centre, size=SIZE):
-    """The shares (W, size, size) of weighted hits (W, Q, 2) in the pixels."""
+    """Fractions (W, size, size) of the light of weighted hits (W, Q, 2) in the pixels."""
     edges = (np.arange(size + 1) - size / 2) * PIXEL
     return np.stack(
         [
@@ -60,7 +60,7 @@ def test_rays_are_the_histogram_of_traced_rays(double_gauss):
     points, weights = patterns.sobol_disc(1 << 15)
     hits, good = traced(lens, FIELD, points)
     assert np.all(good)
-    # 32,768 points in some 200 pixels: each holds its share to about 1 %.
+    # 32,768 points in some 200 pixels: the error of each pixel is about 1 %.
     truth = histogram(hits, np.stack([weights, weights]), np.asarray(found.centre))
     assert difference(np.asarray(found.kernel), truth) < 2.5e-2
 
@@ -75,7 +75,7 @@ CUT = beam_rule(12, "bilateral", drt_jax.Clipped(8, "bilateral"))
     ("field", "rule"), [(0.0, beam_rule(12, "rotational")), (0.3, CUT)], ids=["axis", "clipped"]
 )
 def test_sums_and_moments(field, rule):
-    """Of a model with more rays than it needs: its moments are those of the rays."""
+    """For a model with more rays than it needs: its moments are those of the rays."""
     scene = RIM, Scene.point(field, FAR, WAVES)
     moments = drt_jax.psf_moments(*scene, sampling=rule.rule)
     sigma = float(jnp.sqrt(jnp.max(jnp.diagonal(moments.covariance, 0, 1, 2))))
@@ -107,13 +107,13 @@ def test_sums_and_moments(field, rule):
 @pytest.mark.slow
 def test_no_light_comes_from_beside_a_narrow_pupil():
     """A corner of the camera lens, where 29 % of the light passes: far from the rays, polynomials
-    of degree 12 seem to pass all apertures again. Against a histogram of 19,000 rays."""
+    of degree 12 seem to pass all apertures again. Compared with a histogram of 19,000 rays."""
     lens, field, pixel = drt_jax.load_lens("camera_50mm"), np.array([0.3, 0.3]), 0.02
     scene = lens, Scene.point(field, np.inf, (0.53,))
     rule = beam_rule(12, "none", drt_jax.Clipped(6, "none"))
     found = drt_jax.psf(*scene, pixel, SIZE, sampling=Sampling("rays", rule, 96))
     points, _ = patterns.sobol_disc(1 << 16)
-    # Machine code as good as this takes no longer to make, and runs five times faster.
+    # This optimisation takes no longer to compile, and the code runs five times faster.
     often = {"xla_backend_optimization_level": 1}
 
     def traced(points):
@@ -134,7 +134,7 @@ def test_no_light_comes_from_beside_a_narrow_pupil():
 def test_waves_are_the_sum_of_plane_waves(double_gauss):
     lens, field = double_gauss[0], FIELD
     found = drt_jax.psf(*double_gauss, PIXEL, SIZE, sampling=WAVE_MODEL)
-    # One plane wave a ray of a fine Gauss rule, all path differences to the sphere at infinity.
+    # One plane wave for each ray of a fine Gauss rule; path differences to the sphere at infinity.
     points, weights = patterns.disc(40, 100)
     rays = drt_jax.trace_rays(lens, Scene.point(field, FAR, WAVES), points)
     for w, wavelength in enumerate(WAVES):
@@ -176,7 +176,7 @@ def paraboloid(semi_diameter=1.0, sensor=50.0):
 
 
 def mirror_kernel(kind, lens, wavelength, pixel):
-    """On 21 x 21 pixels; one program of a kind."""
+    """A kernel of 21 x 21 pixels; one program for each model."""
     model = Sampling(kind, beam_rule(10, "rotational"), 192)
     return np.asarray(
         drt_jax.psf(lens, Scene.point(0.0, np.inf, wavelength), pixel, SIZE, sampling=model).kernel[
@@ -194,14 +194,14 @@ def test_waves_of_a_perfect_mirror_are_airys_pattern():
     x = np.pi * np.hypot(*np.meshgrid(place, place)) / (wavelength * 1e-3 * 25)
     airy = np.pi / 4 * (2 * j1(x) / x) ** 2 * (pixel / (wavelength * 1e-3 * 25)) ** 2
     airy = np.einsum("yixj,i,j->yx", airy.reshape(SIZE, 4, SIZE, 4), weights / 2, weights / 2)
-    # f/25 by sines is what is left.
+    # The rest is the difference of tangents and sines at f/25.
     assert np.abs(found - airy).max() < 1e-3 * airy.max()
     assert abs(np.sum(found) - np.sum(airy)) < 1e-3
 
 
 @pytest.mark.slow
 def test_waves_come_to_rays_when_they_are_short():
-    # A disc out of focus; no glass, so that the rays do not know the wavelength.
+    # A defocused disc; without glass, so that the rays do not depend on the wavelength.
     lens = paraboloid(sensor=55.0)
     rays = mirror_kernel("rays", lens, 0.5, 0.02)
     apart = [difference(rays, mirror_kernel("waves", lens, w, 0.02)) for w in (2.0, 0.5, 0.125)]
@@ -272,11 +272,11 @@ def test_auto_says_how_good_the_gaussian_is(double_gauss):
     with pytest.warns(UserWarning, match=beside) as said:
         model = drt_jax.converge(drt_jax.psf, *double_gauss, PIXEL, SIZE, "auto", 0.2)
     assert {one.filename for one in said} == {__file__}
-    # Here the Gaussian misses the waves by more than half of the light.
+    # Here the Gaussian differs from the waves by more than half of the light.
     assert 0.3 < model.errors["gaussian"] < 2
     assert model.kind != "gaussian"
     assert set(model.errors) == {"gaussian", "rays"}
-    # It keeps its tolerance of finer waves.
+    # Compared with finer waves, it keeps its tolerance.
     pair = (drt_jax.psf(*double_gauss, PIXEL, SIZE, sampling=m).kernel for m in (model, WAVE_MODEL))
     assert difference(*map(np.asarray, pair)) < 0.25
 
@@ -301,7 +301,7 @@ def test_a_model_serves_inside_jit_and_vmap(double_gauss):
     np.testing.assert_allclose(kernels(fields)[1], alone, atol=1e-12)
     with pytest.raises(ValueError, match="make the sampling outside"):
         jax.jit(lambda f: drt_jax.psf(lens, Scene.point(f, far, waves), PIXEL).kernel)(fields[0])
-    # It is made for fields along y: elsewhere half of the pupil is not all of it.
+    # It is made for fields along y: at others, half of the pupil does not represent the whole.
     beside = jnp.radians(jnp.array([4.0, 3.0]))
     assert not np.any(kernels(jnp.stack([beside, fields[0]]))[0])
     several = Scene.radians(beside[None], far, waves)
@@ -340,7 +340,8 @@ def test_the_norm_of_a_tolerance(double_gauss):
 
 @pytest.mark.slow
 def test_no_program_takes_several_matrices_to_lapack_at_once():
-    """LAPACK's loop over matrices waits for XLA's threads in one of them: two of them never end."""
+    """LAPACK's loop over matrices waits for XLA's threads inside one of them: two such loops never
+    end."""
     lens, rule = drt_jax.load_lens("singlet"), beam_rule(4, "bilateral")
     model = drt_jax.Sampling("waves", rule, 8)
 

@@ -1,4 +1,4 @@
-"""The choice of a PSF model: what it says where light, degrees or grids do not suffice."""
+"""The choice of a PSF model: its messages if light, degrees or grids do not suffice."""
 
 import re
 import warnings
@@ -17,7 +17,7 @@ PIXEL, WAVE = 0.01, 0.5
 
 
 def beam_of(radius, aperture=0.1):
-    """Light all over a disc of a radius in mm on the sensor, and in a round cone."""
+    """Uniform light on a disc of a given radius in mm on the sensor, in a circular cone."""
     points, weights = disc(12, 25)
     points = np.asarray(points).T[:, None]
     directions = np.concatenate([aperture * points, np.ones_like(points[:1])])
@@ -37,13 +37,14 @@ def size_told(radius, kind):
 
 
 def test_the_size_that_would_do():
-    """Of rays all over a disc; of Airy's pattern, whose encircled energy is 1 - J0^2 - J1^2."""
+    """For rays that fill a disc; and for Airy's pattern, whose encircled energy is 1 - J0^2 -
+    J1^2."""
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         module._warn(np.array([[0.01]]), None, None, None, "rays")
     assert 19 <= size_told(0.1, "rays") <= 21 and size_told(1e-6, "rays") == 7
     half = size_told(0.0, "waves") * PIXEL / 2
     v = 2 * np.pi * 0.1 * half / (WAVE * 1e-3)
-    assert 0.988 < 1 - j0(v) ** 2 - j1(v) ** 2 < 0.993  # in the circle; the square holds more
+    assert 0.988 < 1 - j0(v) ** 2 - j1(v) ** 2 < 0.993  # in the circle; the square contains more
     both = size_told(0.1, "waves")
     assert size_told(0.1, "rays") < both <= 20 + 2 * half / PIXEL

@@ -1,4 +1,4 @@
-"""Images against closed forms and against what OpticStudio prints."""
+"""Images compared with closed forms and with listings of OpticStudio."""
 
 import dataclasses
 
@@ -19,8 +19,8 @@ VARIANCES = {0.1: 0.00042233607320576864, -1.0: 0.042233607320576856}
 
 @pytest.fixture(scope="module")
 def variances():
-    """Of the sensor's defocus: those of the moments with their derivative, and those of a beam
-    moved to it, in one program."""
+    """Over the defocus of the sensor, in one program: variances of the moments with their
+    derivative, and those of a beam moved to the sensor."""
     surface = {"radius": -100.0, "conic": -1.0, "mirror": True, "thickness": -50.0}
     lens = load_lens({"surfaces": [surface | {"stop": True, "semi_diameter": 20.0}]})
     scene = 0.0, np.inf, WAVE
@@ -47,7 +47,8 @@ def variances():
 @pytest.mark.slow
 @pytest.mark.parametrize("delta", VARIANCES)
 def test_the_exact_moment_of_defocus(variances, delta):
-    """P11: a ray meets the sensor at delta h / (f - h^2 / (4 f)); so do beams moved to it."""
+    """P11: a ray meets the sensor at delta h / (f - h^2 / (4 f)); the same for beams that are moved
+    to it."""
     wanted = VARIANCES[delta]
     for step in (delta, -delta):  # the light runs backwards; only its size counts
         found, slope, (xx, xy, yy) = variances(step)
@@ -59,7 +60,7 @@ def test_the_exact_moment_of_defocus(variances, delta):
 
 @pytest.mark.slow
 def test_the_huygens_psf_that_opticstudio_prints(shared):
-    """P04: to its sampling of the pupil's edge."""
+    """P04, within the error of OpticStudio's sampling of the edge of the pupil."""
     rows = yaml.safe_load((shared / "psf_cases.yaml").read_text())["cases"]
     case = next(row for row in rows if row["id"].startswith("P04"))
     printed, tolerance = case["reference"], case["tolerance"]
@@ -73,12 +74,13 @@ def test_the_huygens_psf_that_opticstudio_prints(shared):
     diagonal = np.array(printed["diagonal_from_centre_pixels_0_to_11"])
     pixel = spacing / 3
     found = drt_jax.psf(*scene, pixel, size, sampling=model)
-    # By the peak without aberrations, of the cone from the exit pupil.
+    # Relative to the peak without aberrations, for the cone from the exit pupil.
     pupil = drt_jax.first_order(lens, np.inf, 0.543).exit_pupil
     away = float(lens.sensor - lens.vertices[-2] - pupil.position[0])
     sine = np.sin(np.arctan(float(pupil.semi_diameter[0]) / away))
     light = np.asarray(found.kernel[0]) * wave**2 / (pixel**2 * np.pi * sine**2)
-    # A pixel holds the mean over its square: that of a point is less by its bend / 24.
+    # A pixel is the mean over its square, larger than the value at its centre by the second
+    # derivatives / 24.
     around = sum(np.roll(light, s, a) for s in (-1, 1) for a in (0, 1)) - 4 * light
     light = light - around / 24
     across = light[63, 63::3][: wanted.size]

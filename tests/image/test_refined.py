@@ -1,4 +1,4 @@
-"""Cells of the pupil by a tolerance: what is asked, tried and returned; no optics."""
+"""Cells of the pupil by a tolerance: arguments, trials and results; without optics."""
 
 import warnings
 
@@ -14,7 +14,7 @@ NONE = lambda *_: 0  # noqa: E731
 
 
 def rule(truth, cells):
-    """With an error that falls with the square of the cells."""
+    """A rule whose error is proportional to 1 / cells^2."""
     tried.append(cells)
     return jnp.asarray(truth) + 5.0 / cells**2, jnp.zeros(2)
 

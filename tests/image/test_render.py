@@ -1,4 +1,4 @@
-"""A picture through a lens: even light, points, borders of tiles, derivatives, bad input."""
+"""A picture through a lens: uniform light, points, borders of tiles, derivatives, invalid input."""
 
 import dataclasses
 import functools
@@ -63,7 +63,7 @@ def test_a_row_of_tiles_is_blurred_by_each_pixels_own_kernel():
 
 @pytest.mark.slow
 def test_a_few_kernels_give_back_those_that_they_span():
-    """Two kernels span all; a third place, the same as the first, adds nothing and no NaN."""
+    """Two kernels span all; a third position, equal to the first, adds nothing and gives no NaN."""
     random = np.random.default_rng(2)
     two, share = random.random((2, 5, 5)), random.random((4, 6, 2))
     seen = jnp.asarray(np.einsum("yxr,rij->yxij", share, two))
@@ -82,7 +82,7 @@ def test_a_few_kernels_give_back_those_that_they_span():
 
 @pytest.mark.slow
 def test_a_pixel_collects_the_kernel_of_each_point_around_it():
-    """Against a sum over points with kernels of their own, light and all, one by one in NumPy."""
+    """Compared with a sum over points, each with its own kernel and light, one by one in NumPy."""
     lens, method, margin = lens_of(), method_of(), 6
     scene, focal = picture(4), float(method.focal)
     image = np.asarray(drt_jax.render(lens, scene, np.inf, PIXEL, WAVES, method))
@@ -175,7 +175,8 @@ def test_points_land_where_their_centroids_are():
 
 @pytest.mark.slow
 def test_no_seam_lies_between_tiles():
-    """Tiles of another size give the same picture, and those that blend their corners nearly."""
+    """Tiles of another size give the same picture, and tiles that blend the kernels of their
+    corners nearly so."""
     lens, method = lens_of(), method_of()
     image = drt_jax.render(lens, picture(), np.inf, PIXEL, WAVES, method)
     other = dataclasses.replace(method, tile=(7, 5))
@@ -240,7 +241,7 @@ def test_hidden_parts_go_on_as_what_is_seen_beside_them():
 
 @pytest.mark.slow
 def test_a_near_plane_covers_what_lies_behind_it_by_its_blurred_cover():
-    """Planes of radiance 1 and 0.25: by the cover alone, in the near plane's kernels."""
+    """Planes of radiance 1 and 0.25: the cover is blurred with the kernels of the near plane."""
     lens, near, far = lens_of(), 800.0, 5000.0
     mask = (np.arange(SIDE)[:, None] < 20) & (np.arange(SIDE) > 8)
     depth = np.where(mask, near, far)
@@ -289,8 +290,8 @@ def test_bad_input_gets_one_line(changes, message):
 
 
 def test_few_kernels_keep_sum_and_centroid():
-    """Skew kernels of a 5 x 7 grid from four of them; projected alone, centroids are off by 0.009
-    pixels."""
+    """Skew kernels of a 5 x 7 grid from four of them; with projection alone, the error of centroids
+    is 0.009 pixels."""
     k = np.arange(11) - 5.0
     x, y = np.meshgrid(k, k)
     shift = np.stack(np.meshgrid(np.linspace(-0.3, 0.3, 7), np.linspace(-0.1, 0.3, 5)), -1)

@@ -1,4 +1,4 @@
-"""float32, JAX's default: right, or told."""
+"""float32, JAX's default: results are right, or there is a warning."""
 
 import warnings
 
@@ -26,8 +26,8 @@ def single(lens):
 
 @pytest.mark.slow
 def test_a_telescope_of_metres_is_told_a_camera_is_right():
-    """The rounding that is measured, against path differences in float64: the singlet, 1e-4 waves,
-    is silent; Hubble, 1e-2 waves, is not."""
+    """The estimate of rounding compared with path differences in float64: the singlet, 1e-4 waves,
+    gives no warning; Hubble, 1e-2 waves, does."""
     pupil = drt_jax.pupil.sobol_disc(48)[0]
     for name, field, loud in (("singlet", 0.1, False), ("hubble", 0.0005, True)):
         exact = drt_jax.wavefront(drt_jax.load_lens(name), Scene.point(field, np.inf, GREEN), pupil)
@@ -46,14 +46,14 @@ def test_a_telescope_of_metres_is_told_a_camera_is_right():
 
 @pytest.mark.slow
 def test_strehl_of_hubble():
-    """1 on the axis; float32 once gave 0.008 without a word."""
+    """1 on the axis; float32 once gave 0.008 without a warning."""
     with pytest.warns(UserWarning, match=REMEDY):
         found = drt_jax.strehl(single("hubble"), Scene.radians(jnp.zeros(1), np.inf, GREEN))
     np.testing.assert_allclose(found, 1, atol=0.02)
 
 
 def test_no_light_comes_from_far_beside_the_rays():
-    """Where polynomials run away, and come back to where the stop seems to pass them: cells of a
+    """Polynomials extrapolate, and come back to values that the stop seems to pass, in cells of a
     grid of directions three times as wide as the cone of 0.1."""
     beam, cells, step = beam_of(1.0), 30, 0.02
     axes = jnp.zeros((2, 1)), jnp.full((2, 1), step)
@@ -66,7 +66,7 @@ def test_no_light_comes_from_far_beside_the_rays():
 
 @pytest.mark.slow
 def test_strehl_of_a_phone_at_a_slant():
-    """32.2 degrees: 0.644 in float64; 0.03 once, of light far beside the rays, without a word."""
+    """32.2 degrees: 0.644 in float64; once 0.03, by light far from the rays, without a warning."""
     field, rule = jnp.array([np.radians(32.2)], jnp.float32), drt_jax.Gauss(8, "bilateral")
     found = drt_jax.strehl(
         single("phone"),
@@ -79,7 +79,7 @@ def test_strehl_of_a_phone_at_a_slant():
 @pytest.mark.slow
 def test_rounding_of_a_high_image_is_told():
     """At 67 degrees hits 235 mm high are rounded by 0.29 of 2^-16 mm RMS, and paths by nearly as
-    much: 0.0074 waves. Strehl ratios were 0.02 off without a word."""
+    much: 0.0074 waves. The error of Strehl ratios was 0.02, without a warning."""
     lens = single("hypergon_100mm")
     scene = checked_scene(lens, Scene.point(np.radians(67.0), np.inf, GREEN))
     told = [rounding.path_rounding(lens, [scene], of_beams) for of_beams in (False, True)]
@@ -89,8 +89,8 @@ def test_rounding_of_a_high_image_is_told():
 
 @pytest.mark.slow
 def test_float32_stays():
-    """Where a process has float64, too, dtypes follow the lens, and nothing is promoted. Traced,
-    not compiled; one radius stands for azimuths."""
+    """In a process that also has float64, dtypes follow the lens, and nothing is promoted. Traced,
+    not compiled; one radius represents all azimuths."""
     lens, rule = single("hubble"), drt_jax.Clipped(6, "rotational")
     light = drt_jax.Sampling("waves", beam_rule(8, "rotational", rule), 32)
 
@@ -104,7 +104,7 @@ def test_float32_stays():
 
 @pytest.mark.slow
 def test_a_focus_that_rounding_moves_is_told():
-    """Of a telescope, by 0.09 of the depth of focus; not of a camera."""
+    """The shift is 0.09 of the depth of focus for a telescope; there is no warning for a camera."""
     remedy = r'in float32 the focus may be wrong by 9e-02 of its depth.*"jax_enable_x64", True'
     with pytest.warns(UserWarning, match=remedy) as said:
         drt_jax.field_curvature(
@@ -126,8 +126,8 @@ def test_a_focus_that_rounding_moves_is_told():
     "name, pixel, loud", [("microscope_objective", 5e-4, True), ("double_gauss", 2.2e-3, False)]
 )
 def test_kernels_of_rays_that_rounding_spoils_are_told(name, pixel, loud):
-    """At Airy's radius those of a microscope objective are off by 6e-3, those of a lens with a
-    large spot by 5e-5, though hits of both are rounded by more than 1e-2 of a pixel."""
+    """At Airy's radius the error is 6e-3 for a microscope objective, and 5e-5 for a lens with a
+    large spot, although hits of both are rounded by more than 1e-2 of a pixel."""
     assert rounding.hit_rounding(single(name)) > 0.01 * pixel
     with warnings.catch_warnings(record=True) as said:
         warnings.simplefilter("always")
@@ -139,7 +139,7 @@ def test_kernels_of_rays_that_rounding_spoils_are_told(name, pixel, loud):
 
 @pytest.mark.slow
 def test_a_tolerance_that_rounding_spoils_is_refused():
-    """Where it is asked for; what is left to the call is a warning, see above."""
+    """If it is given; without a tolerance there is a warning, see above."""
     small, scene = single("microscope_objective"), Scene.point(0.0, np.inf, GREEN)
     remedy = (
         'sampling: in float32 {} may be wrong by .*"jax_enable_x64", True.*leave the tolerance out'
@@ -155,8 +155,8 @@ def test_a_tolerance_that_rounding_spoils_is_refused():
 @pytest.mark.slow
 @pytest.mark.parametrize("answer", ["rays", "kernel", "contrast", "energy"])
 def test_no_product_is_rounded_by_a_gpu(answer):
-    """GPUs round the factors of float32 products of matrices to 10 bits unless a program asks for
-    more: the refractive index would be 5e-4 off."""
+    """GPUs round the factors of float32 products of matrices to 10 bits unless a program requests
+    more precision: the error of the refractive index would be 5e-4."""
     waves, rule = jnp.array([0.5, 0.6]), drt_jax.Gauss(4, "bilateral")
     pupil, field = jnp.asarray(drt_jax.pupil.sobol_disc(5000)[0]), jnp.array([0.1])
     model = drt_jax.Sampling("waves", beam_rule(6, "bilateral"), 32)

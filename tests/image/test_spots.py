@@ -1,4 +1,5 @@
-"""Spots, throughput and illumination over the field: closed forms, moments, random rays."""
+"""Spots, throughput and illumination over the field, compared with closed forms, moments and random
+rays."""
 
 import dataclasses
 
@@ -19,7 +20,7 @@ from ..known import check_slopes, freed
 
 WAVES = (0.6, 0.53, 0.48)
 COOKE = freed(load_lens("cooke_triplet"))
-# The triplet behind a rim that cuts its oblique beams.
+# The triplet behind a rim that vignettes its oblique beams.
 RIM = dataclasses.replace(COOKE, semi_diameter=COOKE.semi_diameter.at[0].set(6.5))
 ANGLES = np.array([0.1, 0.2, 0.3])
 SMALL = Gauss(4, "none")
@@ -28,13 +29,13 @@ SCENE = Scene.radians(ANGLES, np.inf, WAVES)
 
 @pytest.fixture(scope="module")
 def rules():
-    """Those of the triplet, whole and clipped."""
+    """Rules of the triplet, without and with vignetting."""
     return [drt_jax.converge(drt_jax.spot_diagram, lens, SCENE) for lens in (COOKE, RIM)]
 
 
 @pytest.mark.slow
 def test_cos4_of_a_small_hole():
-    """What a pixel collects through a hole falls with the fourth power of the cosine."""
+    """The light of a pixel through a hole is proportional to the fourth power of the cosine."""
     plate = [{"curvature": 0, "index": 1.5, "thickness": 0.1}, {"curvature": 0, "thickness": 1.0}]
     stop = {"curvature": 0, "thickness": 30.0, "semi_diameter": 0.003, "stop": True}
     lens, fields = load_lens({"surfaces": [*plate, stop]}), np.array([0.0, 0.2, 0.5, 1.0])
@@ -48,8 +49,8 @@ def test_cos4_of_a_small_hole():
 
 @pytest.mark.slow
 def test_the_cone_of_a_ball():
-    """A ball with the stop at its centre focuses on a sphere about it: a pencil as wide as the stop
-    is seen, cos(field), which a flat sensor sees as cos^2."""
+    """A ball with the stop at its centre focuses on a sphere about the centre. A beam has the
+    projected width of the stop, cos(field), and a flat sensor receives cos^2."""
     glass = {"index": 1.5, "thickness": 10.0}
     stop = {"curvature": 0, "semi_diameter": 0.003, "stop": True}
     ball = [{"radius": 10.0} | glass, stop | glass, {"radius": -10.0, "thickness": 5.0}]
@@ -62,8 +63,8 @@ def test_the_cone_of_a_ball():
 
 @pytest.mark.slow
 def test_a_perfect_cone():
-    """n = 1.5, R = 10, k = -1/n^2 has its focus at 30 mm, for any aperture: pi sin^2 of the angle
-    at which the rim is seen, and the Airy radius 1.22 wavelength / (2 n sin)."""
+    """n = 1.5, R = 10, k = -1/n^2 has its focus at 30 mm, for any aperture: the cone is pi sin^2 of
+    the angle of the rim, and the Airy radius 1.22 wavelength / (2 n sin)."""
     stop = {"curvature": 0, "thickness": 5.0, "semi_diameter": 6.0, "stop": True}
     front = {"radius": 10, "conic": -1 / 1.5**2, "index": 1.5, "thickness": 30.0}
     lens = load_lens({"surfaces": [stop, front]})
@@ -104,7 +105,7 @@ def test_spots_are_those_of_the_moments(rules, clipped):
 
 @pytest.mark.slow
 def test_the_light_of_random_rays(rules):
-    """The area of directions within the hull of those that arrive, and how many do."""
+    """The area of the convex hull of the directions that arrive, and the number of rays that do."""
     points = pupil.random_disc(40_000, 1)[0]
     light = drt_jax.solid_angle(RIM, SCENE, rules[1])
     part = drt_jax.vignetting(RIM, SCENE, rules[1])
@@ -119,7 +120,7 @@ def test_the_light_of_random_rays(rules):
 
 @pytest.mark.slow
 def test_the_illumination_that_designs_keep():
-    """The operand's, of the same rule: cones at one point of the sensor."""
+    """Compared with the operand, by the same rule: cones at one point of the sensor."""
     angles = np.array([0.0, *ANGLES])
     variables = design.Variables.from_lens(COOKE, ["sensor"])
     problem = design.Problem.from_variables(
@@ -181,7 +182,7 @@ def slopes(lens, fields):
 
 @pytest.mark.slow
 def test_no_light_is_infinite_and_dark():
-    """At 89 degrees; the other field is as it is alone, and no NaN leaves."""
+    """At 89 degrees; the other field has the same result as alone, and there is no NaN."""
     (_, (spot, light)), slope = slopes(COOKE, jnp.array([0.1, 1.55]))
     assert not any(np.any(np.isnan(leaf)) for leaf in jax.tree.leaves((slope, spot, light)))
     assert light[0, 0] > 0.9 and light[1, 0] == 0
@@ -192,7 +193,7 @@ def test_no_light_is_infinite_and_dark():
 
 @pytest.mark.slow
 def test_derivatives_by_lens_numbers():
-    """Reverse mode against central differences, with the rim itself among the numbers."""
+    """Reverse mode compared with central differences, also by the rim."""
     steps = {"curvature": 1e-8, "thickness": 1e-6, "semi_diameter": 1e-6}
     check_slopes(lambda lens: slopes(lens, jnp.array([0.1, 0.3])), RIM, steps, 1e-5)
 

@@ -1,4 +1,5 @@
-"""Transfer functions, Strehl ratios and Zernike coefficients: closed forms, other programs."""
+"""Transfer functions, Strehl ratios and Zernike coefficients, compared with closed forms and other
+programs."""
 
 import dataclasses
 
@@ -22,7 +23,7 @@ from ..known import check_slopes, freed
 COOKE = freed(load_lens("cooke_triplet"))
 WAVES = (0.6, 0.53, 0.48)
 RULE = Gauss(8, "bilateral")
-# A paraboloid of f/50: a perfect image, its pupil even in direction cosines to 1e-4.
+# A paraboloid of f/50: a perfect image, whose pupil is uniform in direction cosines to 1e-4.
 MIRROR = {
     "surfaces": [
         {"curvature": 0, "thickness": 100.0, "semi_diameter": 1.0, "stop": True},
@@ -49,7 +50,7 @@ PRINTED = {1: -0.01473686, 4: 0.00031809, 11: 0.00684048, 22: 3.01e-06}
 
 
 def perfect(focus):
-    """Of the mirror, at all `PARTS`: one program for all that is asked of it."""
+    """Results of the mirror, at all `PARTS`, in one program."""
     lines = PARTS * LIMIT
     return drt_jax.transfer(
         load_lens(MIRROR),
@@ -70,8 +71,8 @@ def test_the_transfer_function_of_a_perfect_circle():
 
 @pytest.mark.slow
 def test_a_grid_too_coarse_for_the_blur_shows_no_contrast():
-    """Out of focus by 85 waves, where a cell holds a whole turn of the wave at a quarter of the
-    limit: samples of it would all be equal, a contrast of 0.68."""
+    """For a defocus of 85 waves a cell contains a whole period of the wave at a quarter of the
+    limit: all samples would be equal, with a contrast of 0.68."""
     edges = np.arange(81.0, 89.0, 0.5)
     focus = edges * WAVE * 1e-3 / (1 - np.sqrt(1 - APERTURE**2))
     found = np.array([perfect(float(step)).mtf[0] for step in focus])
@@ -80,7 +81,8 @@ def test_a_grid_too_coarse_for_the_blur_shows_no_contrast():
 
 @pytest.mark.slow
 def test_the_transfer_function_of_an_annulus():
-    """P10: O'Neill's, of an obscuration of 0.612 of the radius; the table by a grid, to 1.5e-4."""
+    """P10, O'Neill's formula for an obscuration of 0.612 of the radius; the table was made by a
+    grid, to 1.5e-4."""
     stop, mirror = MIRROR["surfaces"]
     lens = load_lens({"surfaces": [stop | {"obscuration": {"circle": 0.612}}, mirror]})
     rule = Clipped(6, "bilateral", crossing=False)
@@ -100,8 +102,8 @@ def aspheric(coefficient, radius):
 @pytest.mark.slow
 def test_strehl_with_spherical_aberration():
     """W r^4 waves in the paraxial focus, and with -W r^2 of defocus: by Fresnel's integrals
-    (Mahajan, Optical Imaging and Aberrations II (2011)); small ones by exp(-(2 pi sigma)^2)."""
-    # Ten times larger: many Fresnel zones as seen from the mirror, where the wave is bent.
+    (Mahajan, Optical Imaging and Aberrations II (2011)); for small W by exp(-(2 pi sigma)^2)."""
+    # Ten times larger: many Fresnel zones as seen from the mirror, which deforms the wave.
     radius, larger = 6.0, 10.0
     square = 1 / (1 + (100 / radius - radius / 400) ** 2)
     for waves in (0.1, 0.5, 1.0, 2.0):
@@ -112,7 +114,7 @@ def test_strehl_with_spherical_aberration():
             moved = dataclasses.replace(lens, sensor=lens.sensor + step)
             found = float(drt_jax.strehl(moved, Scene.radians([0.0], np.inf, WAVE), RULE)[0, 0])
             wanted = sum(a**2 for a in fresnel(width * np.sqrt(waves))) / (width**2 * waves)
-            # Light is not quite even over the directions of a paraboloid that is bent.
+            # Light is not quite uniform over the directions of a deformed paraboloid.
             assert abs(found - wanted) < (2e-4 if waves == 0.1 else 4e-3)
             if waves == 0.1:
                 assert abs(found - np.exp(-((2 * np.pi * waves * sigma) ** 2))) < 2e-4
@@ -121,7 +123,7 @@ def test_strehl_with_spherical_aberration():
 @pytest.mark.slow
 def test_defocus_and_strehl():
     """|OTF| of a defocused circle by Hopkins (Proc. R. Soc. A 231, 91 (1955)), here summed over the
-    common area of two pupils; the Strehl ratio is sinc^2 of the waves at the edge."""
+    overlap of two pupils; the Strehl ratio is sinc^2 of the waves at the edge."""
     lens = aspheric(0.0, 1.0)
     side = (np.arange(2000) + 0.5) / 1000 - 1
     x, y = np.meshgrid(side, side)
@@ -152,7 +154,7 @@ def traced(field, wavelength):
 
 @pytest.mark.slow
 def test_the_limit_of_short_wavelengths_is_that_of_rays():
-    """And the rays' is the mean over many traced ones."""
+    """The transfer function of rays is the mean over many traced ones."""
     fields, frequencies = [0.0, 0.2], np.linspace(0, 20, 5)
     rays = drt_jax.transfer(
         COOKE,
@@ -172,8 +174,8 @@ def test_the_limit_of_short_wavelengths_is_that_of_rays():
 
 @pytest.mark.slow
 def test_colours_add_up_about_one_point():
-    """Lateral colour costs contrast: the sum of each wavelength's own, turned by where its light
-    is."""
+    """Lateral colour reduces contrast: the sum over the wavelengths has phases from the positions
+    of their images."""
     frequencies = np.linspace(0, 100, 6)
 
     def otf(weights):
@@ -246,8 +248,8 @@ def slopes(lens, field):
 
 @pytest.mark.slow
 def test_fringe_coefficients():
-    """The same wavefront: terms of n, m are sqrt(n + 1) or sqrt(2 n + 2) times Noll's; the order as
-    it is printed."""
+    """For the same wavefront, terms of n, m are sqrt(n + 1) or sqrt(2 n + 2) times those of Noll;
+    the order is that of listings."""
     terms = fringe_terms()
     order = [(0, 0), (1, 1), (1, -1), (2, 0), (2, 2), (2, -2), (3, 1), (3, -1), (4, 0), (3, 3)]
     assert terms[:10] == order and terms[15] == (6, 0) and terms[24] == (8, 0)
@@ -273,7 +275,7 @@ def test_no_light_no_contrast():
 
 @pytest.mark.slow
 def test_derivatives_by_lens_numbers():
-    """Reverse mode against central differences, in a clipped pupil."""
+    """Reverse mode compared with central differences, in a clipped pupil."""
     lens = dataclasses.replace(COOKE, semi_diameter=COOKE.semi_diameter.at[0].set(6.5))
     field = jnp.array([0.0, 0.25])
     check_slopes(
@@ -285,9 +287,9 @@ def test_derivatives_by_lens_numbers():
 
 
 def counted(field, front, cells=500, shifts=(18, 43, 86)):
-    """MTF (2, N) of the Cooke triplet, its first surface `front` mm wide, and frequencies: sums
-    over cells of the direction cosines from the sphere of the exit pupil, interpolated between
-    20,000 rays, without polynomials."""
+    """MTF (2, N) of the Cooke triplet, whose first surface has the semi-diameter `front` mm, and
+    frequencies: sums over cells of the direction cosines from the sphere of the exit pupil,
+    interpolated between 20,000 rays, without polynomials."""
     semi = jnp.full_like(COOKE.semi_diameter, jnp.inf)
     semi = semi.at[COOKE.stop].set(COOKE.semi_diameter[COOKE.stop])
     side = np.linspace(-1.04, 1.04, 161)
@@ -297,7 +299,7 @@ def counted(field, front, cells=500, shifts=(18, 43, 86)):
     rays = drt_jax.trace_rays(lens, Scene.point(field, np.inf, 0.55), points)
     assert not np.any(rays.status)
     hits, along = np.asarray(rays.points)[0], np.asarray(rays.directions)[0, :, -1]
-    # Back along the rays to the sphere about the middle of the spot.
+    # Back along the rays to the sphere about the centroid of the spot.
     away = float(
         lens.sensor
         - lens.vertices[-2]
@@ -322,7 +324,7 @@ def counted(field, front, cells=500, shifts=(18, 43, 86)):
 
 @pytest.mark.slow
 def test_the_transfer_function_of_a_clipped_pupil():
-    """Where the front lets 86 % of the light through, against a count of cells."""
+    """The front passes 86 % of the light; compared with a count of cells."""
     wanted, lines = counted(0.25, 6.5)
     lens = dataclasses.replace(COOKE, semi_diameter=COOKE.semi_diameter.at[0].set(6.5))
     found = drt_jax.transfer(
@@ -337,7 +339,7 @@ def test_the_transfer_function_of_a_clipped_pupil():
 @pytest.mark.slow
 def test_strehl_does_not_depend_on_the_direction_of_a_field():
     """The field along y and along the diagonal of x and y, where the clipped pupil is a slanted
-    oval: tilts along x and y then belong together."""
+    oval, so that tilts along x and y are correlated."""
     lens = dataclasses.replace(COOKE, semi_diameter=COOKE.semi_diameter.at[0].set(4.0))
     fields = 0.12 * np.array([[0.0, 1.0], [0.5**0.5, 0.5**0.5]])
     along, diagonal = drt_jax.strehl(

@@ -1,4 +1,5 @@
-"""The best linear filter: its closed-form error against images that NumPy makes and filters."""
+"""The best linear filter: its closed-form error compared with images that NumPy makes and
+filters."""
 
 import jax
 import jax.numpy as jnp
@@ -15,7 +16,7 @@ SIDE, MIX = 32, np.array([[1.0, 0.8], [0.8, 1.2]])
 
 @pytest.fixture(scope="module")
 def scene():
-    """Spectrum of a scene of two channels, kernels of three points, their noise."""
+    """Spectrum of a scene with two channels, kernels of three points, and noise."""
     frequency = np.fft.fftfreq(SIDE)
     line = 0.01 / (frequency[:, None] ** 2 + frequency[None] ** 2 + 0.01)
     mean = jnp.array([[0.5, -0.3], [0.0, 0.4]])
@@ -26,7 +27,7 @@ def scene():
 
 
 def images(power, kernels, noise, count=600):
-    """Periodic random scenes of this spectrum, and what the camera sees of them."""
+    """Periodic random scenes with this spectrum, and their images in the camera."""
     rng = np.random.default_rng(0)
     white = rng.normal(size=(count, SIDE, SIDE, 2)) @ np.linalg.cholesky(MIX).T
     shape = np.sqrt(power[..., :1, 0])

@@ -1,4 +1,4 @@
-"""Our convolutions against XLA's own, in float64, and against NumPy's sums."""
+"""Our convolutions compared with XLA's own, in float64, and with sums in NumPy."""
 
 import jax
 import jax.numpy as jnp
@@ -19,8 +19,8 @@ def plain(images, kernel):
     )
 
 
-# Winograd's, all images at once and one by one, also of sides that are no multiples of 4; gathered;
-# and few channels in or out.
+# Winograd's algorithm, for all images at once and one by one, also for sides that are not multiples
+# of 4; gathered images; and few channels in or out.
 CASES = {
     "large": ((2, 32, 36, 32), 32),
     "odd": ((2, 65, 34, 32), 32),

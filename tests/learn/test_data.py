@@ -48,7 +48,7 @@ def test_memory_mapped_patches_are_the_same(folder):
 
 
 def test_patches_of_any_number_of_bands(folder):
-    """Of photographs the luminance, by the weights of ITU-R 601; eight bands from arrays."""
+    """For photographs the luminance, with the weights of ITU-R 601; eight bands from arrays."""
     config = DataConfig(root=str(folder), crops_per_image=3)
     grey = load_patches(config, 40, seed=0, bands=1)
     colours = load_patches(config, 40, seed=0).train.astype(float)
@@ -108,7 +108,7 @@ def test_texture_set(shared):
 
 
 def test_split_is_a_permutation_of_all_where_all_are_usable(tmp_path):
-    """Runs that are resumed, and results on disk, rest on which crop is where."""
+    """Runs that are resumed, and results on disk, depend on the positions of the crops."""
     shapes = [(60, 70, 3), (60, 70), (60, 70, 4), (90, 50, 3), (50, 50, 3), (41, 40, 3), (99, 45)]
     generator = np.random.default_rng(1)
     for name, shape in zip("gfedcba", shapes):
@@ -146,7 +146,7 @@ def test_few_usable_among_thousands(tmp_path):
 
 
 def test_split_without_the_damaged(folder):
-    """What only decoding shows does not take a place in the split either."""
+    """A file whose damage only decoding shows has no place in the split either."""
     for path in folder.rglob("[0-2].png"):
         path.write_bytes(path.read_bytes()[:3000])
     config = DataConfig(root=str(folder), crops_per_image=3, test_fraction=0.5)

@@ -1,4 +1,4 @@
-"""The error image by image is that of the whole batch, with its gradient."""
+"""The error computed image by image equals that of the whole batch, with its gradient."""
 
 import functools
 import json
@@ -22,7 +22,7 @@ def red_net(layers, channels):
 
 
 def pixel_by_pixel():
-    """A network of a user: smooth, without convolutions, weights in a tuple."""
+    """A user's network: smooth, without convolutions, with weights in a tuple."""
     rng = np.random.default_rng(1)
     weights = jnp.asarray(rng.normal(size=(3, 8))), jnp.asarray(rng.normal(size=(8, 3)))
 
@@ -33,7 +33,7 @@ def pixel_by_pixel():
 
 
 def convolved():
-    """A network of a user with XLA's convolution."""
+    """A user's network with XLA's convolution."""
     kernel = jnp.asarray(np.random.default_rng(2).normal(size=(5, 5, 3, 3)))
     names = "NHWC", "HWIO", "NHWC"
 
@@ -43,7 +43,7 @@ def convolved():
     return kernel, restore
 
 
-# A network, the shape of its images, and the number of groups; 0 where all are taken at once.
+# A network, the shape of its images, and the number of groups; 0 if all are processed at once.
 CASES = {
     "Winograd's": (lambda: red_net(2, 32), (2, 64, 62, 3), 2),
     "several": (lambda: red_net(1, 32), (6, 32, 33, 3), 2),
@@ -152,7 +152,7 @@ def test_two_devices_that_share():
 
 
 def alone(restore, images, truth):
-    """An imager of nothing but a network."""
+    """An imager that consists of a network alone."""
 
     def imager(parameters, *_, last):
         error = last(restore, parameters["network"], images, truth)
@@ -163,7 +163,7 @@ def alone(restore, images, truth):
 
 @pytest.mark.slow
 def test_a_step_of_the_paper_takes_little_memory():
-    """16 patches of 64 x 64 by 298,947 parameters: 100 MB. All features at once take 460."""
+    """16 patches of 64 x 64 and 298,947 parameters: 100 MB. With all features at once it is 460."""
     init, restore = learn.red_net()
     images, truth = (a.astype(jnp.float32) for a in pair((16, 64, 64, 3)))
     rates = {"optics": 1e-3, "network": 1e-3}

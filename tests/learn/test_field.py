@@ -1,4 +1,4 @@
-"""Lens and network together over the field: points, sensor, gradients, both optimisers."""
+"""Lens and network trained together over the field: points, sensor, gradients, both optimisers."""
 
 import dataclasses
 
@@ -14,7 +14,7 @@ from drt_jax.learn.field import FieldImager, ObjectPoints, draw_points, make_fie
 
 WAVES, PIXEL, SIZE, FIELD = (0.6, 0.53, 0.48), 16e-3, 9, np.radians(10)
 SEEN = ObjectPoints(jnp.radians(jnp.array([[1.0, 2.0], [-3.0, 7.0]])), jnp.array([jnp.inf, 3e4]))
-# Good to some per cent here, without a search.
+# Accurate to some per cent here, without a search.
 MODEL = drt_jax.Sampling("rays", beam_rule(6, "none"), 32)
 KINDS = ["curvature", "conic", "coefficients", "thickness", "sensor", "index"]
 
@@ -63,7 +63,7 @@ def test_points_cover_the_field_and_the_depths():
     draw = jax.vmap(lambda key: draw_points(key, 4, FIELD, (1e3, np.inf)))
     seen = draw(jax.random.split(jax.random.key(1), 500))
     part = np.sum(np.tan(seen.fields) ** 2, axis=-1) / np.tan(FIELD) ** 2
-    # One point in each ring of equal area; over all, evenly in area, azimuth and 1 / distance.
+    # One point in each ring of equal area; in total uniform in area, azimuth and 1 / distance.
     np.testing.assert_array_equal(np.floor(4 * part), np.broadcast_to(np.arange(4), part.shape))
     assert np.mean(part) == pytest.approx(0.5, abs=0.01)
     assert np.max(abs(np.mean(np.tan(seen.fields), axis=(0, 1)))) < 0.05 * np.tan(FIELD)

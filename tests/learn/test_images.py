@@ -1,4 +1,4 @@
-"""A zoo of images: each kind is read to what was written, or refused with the reason."""
+"""Many kinds of images: each is read as it was written, or refused with the reason."""
 
 import os
 
@@ -32,7 +32,7 @@ def test_orientation_is_applied(tmp_path, orientation, ending):
     path = tmp_path / f"turned.{ending}"
     upright = zoo.orientations(path, orientation)
     np.testing.assert_array_equal(read(path), upright)
-    # In words: a camera turned to the right, or upside down.
+    # For example a camera rotated to the right, or upside down.
     turned = {1: RGB, 3: RGB[::-1, ::-1], 6: np.rot90(RGB, -1), 8: np.rot90(RGB)}
     if orientation in turned:
         assert abs(upright.astype(int) - turned[orientation]).max() < 20

@@ -17,7 +17,7 @@ def test_parameter_count_of_the_paper():
 @pytest.mark.parametrize("skip_every", [0, 1, 2])
 @pytest.mark.parametrize("input_skip", [False, True])
 def test_against_a_plain_numpy_network(skip_every, input_skip):
-    """The same layers written with loops: 3 + 3 layers of 4 channels."""
+    """The same layers written as loops: 3 + 3 layers of 4 channels."""
     init, apply = red_net(3, 4, skip_every, input_skip)
     parameters = init(jax.random.key(1))
     parameters = jax.tree.map(lambda a: a + 0.1, parameters)
@@ -57,7 +57,7 @@ def test_starts_near_the_identity_and_keeps_float32():
 
 
 def test_learns_to_denoise():
-    """A small network, trained for 150 steps, beats the noisy image it is given."""
+    """A small network, trained for 150 steps, has a smaller error than its noisy input."""
     init, apply = red_net(2, 8)
     clean = jnp.full((4, 16, 16, 3), 0.5, jnp.float32)
     noisy = clean + 0.1 * jax.random.normal(jax.random.key(0), clean.shape, jnp.float32)

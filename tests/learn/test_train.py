@@ -1,4 +1,4 @@
-"""The chain and its training step, against the parts put together by hand."""
+"""The imager and its training step, compared with its parts put together by hand."""
 
 import functools
 import itertools
@@ -21,7 +21,7 @@ CAMERA = train.Camera(kernel=9)
 
 @functools.cache
 def blur(near=25000.0, far=25000.0):
-    """The moments of a lens whose sensor moves."""
+    """The moments of a lens whose sensor is trained."""
     lens = drt_jax.load_lens("double_gauss")
     return learn.moments_model(lens, ("sensor",), Scene.point(0.0, (near, far), RGB), 1e-9)[1]
 
@@ -51,7 +51,7 @@ def test_imager_is_the_chain_by_hand():
 
 
 def test_gradient_of_the_loss_by_the_sensor_position():
-    """Through network, sensor layer, kernel and moments, against finite differences."""
+    """Through network, sensor layer, kernel and moments, compared with finite differences."""
     init, restore = learn.red_net(2, 4)
     weights = init(jax.random.key(0))
     imager = train.make_imager(blur(), restore, CAMERA)

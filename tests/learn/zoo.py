@@ -1,4 +1,4 @@
-"""Kinds of images: how each is written, and what is to be seen in it or said of it."""
+"""Kinds of images: how each is written, and its expected content or message."""
 
 import os
 import struct
@@ -13,14 +13,14 @@ from drt_jax.learn.images import MOST_PIXELS
 SIDE = 32
 GENERATOR = np.random.default_rng(0)
 Y, X = np.mgrid[:SIDE, :SIDE] / SIDE
-# Smooth, because JPEG blurs; no channel and no corner like another.
+# Smooth, because JPEG blurs; all channels and corners differ.
 RGB = np.stack([200 * X + 30, 180 * Y + 20, 90 * X + 120 * (1 - Y)], -1).astype(np.uint8)
 GREY = RGB[..., 0]
 DEEP = GENERATOR.integers(0, 2**16, (SIDE, SIDE, 3), dtype=np.uint16)
 NOISE = GENERATOR.integers(0, 256, (SIDE, SIDE, 3), dtype=np.uint8)
 ALPHA = NOISE[..., :1]
 CMYK = np.concatenate([255 - RGB, GREY[::-1, :, None] // 2], -1)
-# What ink leaves of the light: of each colour its share, of all that of black.
+# Light that inks leave: each colour its own fraction, black the same fraction of all.
 INK = np.rint((255.0 - CMYK[..., :3]) * (255.0 - CMYK[..., 3:]) / 255).astype(np.uint8)
 COLOURS = GENERATOR.integers(0, 256, (256, 3), dtype=np.uint8)
 
@@ -30,7 +30,7 @@ def grey(values):
 
 
 def png(path, values, kind, size=None):
-    """Values of 16 bits as PNG, written by hand, since Pillow writes no 16 bits a channel."""
+    """PNG of 16-bit values, written by hand, because Pillow does not write 16 bits per channel."""
     height, width = size or values.shape[:2]
     rows = b"".join(b"\0" + row.astype(">u2").tobytes() for row in values)
     head = struct.pack(">2I5B", width, height, 16, kind, 0, 0, 0)
@@ -43,7 +43,7 @@ def png(path, values, kind, size=None):
 
 
 def pillow(values, **options):
-    """Writes what Pillow sees in an array."""
+    """Writes an array with Pillow."""
     return lambda path: Image.fromarray(values).save(path, **options)
 
 
@@ -68,7 +68,7 @@ def tiff(values, kind, **options):
 
 
 TABLE = (COLOURS.T.astype(np.uint16)) * 257
-# How a file is written, and what is seen in it.
+# How a file is written, and the expected image.
 READ = {
     "rgb.png": (pillow(RGB), RGB),
     "rgb.bmp": (pillow(RGB), RGB),
@@ -112,7 +112,7 @@ def truncated(path):
     path.write_bytes(path.read_bytes()[:-1000])
 
 
-# How a file is written, and what is said of it.
+# How a file is written, and the expected message.
 REFUSED = {
     "float.tif": (tiff((GREY / 255).astype(np.float32), "minisblack"), "of kind F: convert them"),
     "float rgb.tif": (tiff(RGB / 255, "rgb"), "of a kind that is not read"),
@@ -142,7 +142,7 @@ REFUSED = {
 
 
 def orientations(path, orientation):
-    """Write an image that a camera was turned for, and what it shows upright."""
+    """Writes an image with the orientation tag of a camera; and the image when upright."""
     exif = Image.Exif()
     exif[ExifTags.Base.Orientation] = orientation
     Image.fromarray(RGB).save(path, exif=exif)
@@ -151,12 +151,12 @@ def orientations(path, orientation):
 
 
 def readable(name):
-    """Whether Pillow was built with what a kind needs."""
+    """Whether Pillow was built with the support that a kind needs."""
     return features.check({"webp": "webp"}.get(name[:-4], "zlib"))
 
 
 def close(name, patch, seen):
-    """Whether a patch shows what was written: JPEG and a few others are rough."""
+    """Whether a patch agrees with what was written; JPEG and a few others are inexact."""
     is_rough = name.endswith(".jpg") or name.startswith("ycbcr")
     far = np.max(np.abs(patch.astype(int) - seen.astype(int)))
     return patch.dtype == np.uint8 and bool(far <= (6 if is_rough else 1))

@@ -1,4 +1,4 @@
-"""Depths inside of apertures, against geometry."""
+"""Depths inside of apertures, compared with geometry."""
 
 import dataclasses
 
@@ -20,7 +20,8 @@ def three(centre):
 
 
 def test_depth_is_the_distance_from_the_edge():
-    """Of points near to the edge; of an ellipse from the nearest of many points on it."""
+    """For points close to the edge; for an ellipse the distance is that of the nearest of many
+    points on it."""
     angle = np.linspace(0, 2 * np.pi, 200001)
     circle = np.stack([np.cos(angle), np.sin(angle)])
     side = np.linspace(-1, 1, 20001)
@@ -51,7 +52,8 @@ def test_on_the_meridian_and_in_the_middle():
 
 
 def test_clearance_of_all_edges():
-    """Circles of semi-diameters but the stop's, then other apertures, obscurations from outside."""
+    """Circles of semi-diameters except the stop's, then other apertures; obscurations from
+    outside."""
     lens = load_lens("cooke_triplet")
     extra = Apertures(
         jnp.array([[4.0, 0.0], [1.0, 2.0]]), surfaces=(1, 0), kinds=("circle", "rectangle"),

@@ -1,4 +1,4 @@
-"""A lens at another size and the other way round."""
+"""A scaled and a reversed lens."""
 
 import jax
 import jax.numpy as jnp
@@ -13,7 +13,7 @@ from drt_jax.lens.scene import field_of_height
 from drt_jax.lens.surface import surface_sag
 
 WAVE = 0.5875618
-# Coefficients of each form: what has a name, then a few terms.
+# Coefficients of each form: those with a name, then a few terms.
 SOME = {name: [0.3, -0.2, 0.1, 0.05, -0.02, 0.01] for name in FORMS}
 SOME |= {"biconic": [0.04, -0.5, 2e-3], "toroid": [0.04, 2e-3], "linear": [0.2]}
 SOME |= {name: [4.0, 0.03, -0.02, 0.01, 0.02] for name in ("zernike", "qbfs")}
@@ -51,12 +51,12 @@ LENS = drt_jax.load_lens(DOUBLET)
 
 @pytest.mark.slow
 def test_light_takes_the_same_path_backwards():
-    """From where each ray met the sensor, through its point on the stop."""
+    """From the point where each ray met the sensor, through its point on the stop."""
     other, last = drt_jax.flipped(LENS), LENS.vertices[-2]
     points = np.array([[0.3, 0.8], [-0.7, 0.2], [0.0, 0.0]])
     rays = drt_jax.trace_rays(LENS, Scene.point((0.02, 0.05), np.inf, WAVE), points)
     assert not np.any(rays.status)
-    # z from what is the first vertex now.
+    # z from the present first vertex.
     hits = (np.asarray(rays.points)[0] - [0, 0, last]) * [1, 1, -1]
     distance = LENS.sensor - last
     for point, path in zip(points, hits):
@@ -85,7 +85,8 @@ def test_twice_flipped_is_the_lens():
 
 @pytest.mark.slow
 def test_rays_of_a_larger_lens_keep_their_angles():
-    """All hits are as much larger; so is the focal length, and its derivative by the factor."""
+    """All hits and the focal length are multiplied by the factor; also the derivative of the focal
+    length by the factor."""
     points, factor = np.array([[0.3, 0.8], [-0.7, 0.2]]), 2.5
     scene = (0.02, 0.05), 700.0
     one = drt_jax.trace_rays(LENS, Scene.point(*scene, WAVE), points)
@@ -100,7 +101,7 @@ def test_rays_of_a_larger_lens_keep_their_angles():
 
 
 def test_inside_jit_and_with_forms_of_other_numbers_of_terms():
-    """A slope of one term, an asphere and Zernike polynomials; the sensor stays tilted."""
+    """An odd asphere with one term, an asphere and Zernike polynomials; the sensor stays tilted."""
     surfaces = [
         {"form": "linear", "radius": 60.0, "coefficients": {"y": 0.02}, "glass": "N-BK7"},
         {"radius": -45.0, "coefficients": {4: 1e-6, 6: 1e-9, 8: 1e-12}},

@@ -1,4 +1,4 @@
-"""Elements split, bent and cemented, plates and dummies put in, lenses joined."""
+"""Elements split, bent and cemented, plates and dummies inserted, lenses joined."""
 
 import dataclasses
 import warnings
@@ -34,7 +34,7 @@ def schlieren(shared):
 
 
 def power_by_matrices(lens, first, last):
-    """Power of spherical faces in their media, from 2 x 2 matrices of (y, n u)."""
+    """Power of spherical surfaces in their media, from 2 x 2 matrices of (y, n u)."""
     n = np.asarray(lens.index(WAVE))[:, 0]
     whole = np.eye(2)
     for i in range(first, last + 1):
@@ -45,7 +45,8 @@ def power_by_matrices(lens, first, last):
 
 
 def snell_errors(lens, points, wavelengths):
-    """Largest n sin of rays before a spherical surface less that behind, from their points."""
+    """Largest difference of n sin in front of a spherical surface and behind it, from the points of
+    rays."""
     z = np.asarray(lens.vertices)
     bend = np.asarray(lens.curvature)[:, None]
     index = np.asarray(lens.index(wavelengths)).T[:, None, :, None]
@@ -98,7 +99,7 @@ def test_a_stop_inside_of_an_element():
 
 @pytest.mark.slow
 def test_a_dummy_in_a_folded_system_moves_no_ray(shared):
-    """Mirrors, coordinate breaks, apertures and the other sense of light of a lens file."""
+    """Mirrors, coordinate breaks, apertures and reversed light of a lens file."""
     system = schlieren(shared)
     lens, more = system.lens, design.with_dummy(system.lens, 0, 100.0)
     assert more.apertures.surfaces == lens.apertures.surfaces and lens.mirrors[0]
@@ -156,7 +157,8 @@ def test_an_element_bends_at_constant_power():
 
 @pytest.mark.slow
 def test_numbers_may_be_traced():
-    """Derivatives of all edits in one program, against differences and the plain calls."""
+    """Derivatives of all edits in one program, compared with differences and with the calls outside
+    of a trace."""
     lens = load_lens("cooke_triplet")
     edits = {
         "bent": (lambda x: design.bent(lens, (0, 1), x), 0.01),
@@ -244,7 +246,8 @@ def test_two_lenses_have_the_focal_length_of_textbooks():
 
 
 def test_what_two_lenses_carry_is_joined(shared):
-    """Coordinate breaks of the first move the second; apertures and tilts keep their surfaces."""
+    """Coordinate breaks of the first lens move the second; apertures and tilts stay at their
+    surfaces."""
     first, camera = schlieren(shared).lens, load_lens("cooke_triplet")
     tilted = dataclasses.replace(
         camera,
@@ -259,7 +262,7 @@ def test_what_two_lenses_carry_is_joined(shared):
     assert found.apertures.kinds[-1] == "rectangle" and found.count == first.count + 6
     ends = [span for span in found.elements.spans if span[1] == found.count]
     assert len(ends) == 3 and len(found.elements.spans) == 3  # the break of the sensor alone went
-    # The second lens stands as a rigid body in the frame of the first one's break.
+    # The second lens is a rigid body in the axes of the first one's break.
     z, across, turned = found.places
     place = np.stack([np.asarray(across)[:, 0], np.asarray(across)[:, 1], np.asarray(z)], axis=1)
     start = first.count
@@ -290,7 +293,7 @@ def test_two_elements_are_cemented():
 
 
 def mirrored():
-    """The triplet with a mirror in place of its last surface."""
+    """The triplet whose last surface is a mirror."""
     return dataclasses.replace(load_lens("cooke_triplet"), mirrors=(False,) * 5 + (True,))
 
 

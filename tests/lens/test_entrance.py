@@ -1,4 +1,5 @@
-"""The paraxial entrance pupil as the stop: another program's spots, and what of the lens stays."""
+"""The paraxial entrance pupil as the stop: spots of another program, and the parts of the lens that
+stay."""
 
 import dataclasses
 import importlib.resources
@@ -32,7 +33,7 @@ HELD = {"surfaces": [3, 4], "about": 3, "tilt": [0.5, 0, 0]}
 
 @jax.jit
 def spots(lens, field):
-    """RMS radius, mm."""
+    """RMS radii, mm."""
     rule = Gauss(12, "bilateral")
     return jnp.sqrt(
         jnp.trace(psf_moments(lens, Scene.point(field, INF, WAVE), sampling=rule).covariance[0])
@@ -41,8 +42,8 @@ def spots(lens, field):
 
 @pytest.mark.slow
 def test_spots_are_those_that_another_program_prints(shared):
-    """OpticStudio without ray aiming, clear apertures ignored: 16 fields, 1e-9 of each; through the
-    real stop the edge of the field has another."""
+    """OpticStudio without ray aiming, with clear apertures ignored: 16 fields, to 1e-9 each.
+    Through the real stop, spots at the edge of the field are different."""
     cases = yaml.safe_load((shared / "field_cases.yaml").read_text())["cases"]
     case = next(case for case in cases if case["id"].startswith("F01"))
     folder = importlib.resources.files(drt_jax) / "lens" / "catalogue" / "lenses"
@@ -63,7 +64,8 @@ def test_spots_are_those_that_another_program_prints(shared):
 
 @pytest.mark.slow
 def test_all_else_of_the_lens_stays():
-    """First order, and where rays go; the old stop clips nothing but by its own aperture."""
+    """First-order data, and the paths of rays; the old stop clips only if it has an aperture of its
+    own."""
     lens = load_lens({"surfaces": MOVED, "object": {"index": 1.2}, "elements": [HELD]})
     aimed = with_paraxial_pupil(lens, WAVE)
     aimed.check()
@@ -85,7 +87,7 @@ def test_all_else_of_the_lens_stays():
 
 @pytest.mark.slow
 def test_the_pupil_follows_the_lens():
-    """Derivatives through its place and size, beside differences."""
+    """Derivatives through its position and size, compared with differences."""
     lens = load_lens("cooke_triplet")
 
     @jax.jit
@@ -104,7 +106,7 @@ def test_the_pupil_follows_the_lens():
 
 @pytest.mark.slow
 def test_a_file_may_ask_for_it(tmp_path):
-    """`save_lens` writes the planes, so that what it writes is the same lens."""
+    """`save_lens` writes the planes, so that the file has the same lens."""
     lens = load_lens({"surfaces": MOVED, "pupil": "paraxial"})
     wanted = with_paraxial_pupil(load_lens({"surfaces": MOVED}), 0.5875618)
     jax.tree.map(np.testing.assert_array_equal, lens, wanted)
@@ -118,7 +120,8 @@ def test_a_file_may_ask_for_it(tmp_path):
 
 @pytest.mark.slow
 def test_a_pupil_at_infinity_is_none():
-    """A stop in the focus of what is in front of it: said, and inside a trace no ray is."""
+    """A stop in the rear focus of the surfaces in front of it: an error; inside a trace there are
+    no rays."""
     glass = {"index": 2.0, "thickness": 100.0}
     stop = {"radius": INF, "stop": True, "semi_diameter": 2.0} | glass
     lens = load_lens({"surfaces": [{"radius": 50} | glass, stop]})

@@ -66,14 +66,14 @@ def test_plastics_silica_and_fluorite(name):
 
 def test_water_of_daimon_and_masumura():
     """Four Sellmeier terms; relative to vacuum, n_D = 1.33335 at 0.5893 um and 20 C, n_d = 1.3334
-    and the range 0.182 to 1.129 um as refractiveindex.info has them."""
+    and the range 0.182 to 1.129 um as in refractiveindex.info."""
     np.testing.assert_allclose(index("water", 0.5893), 1.33335, atol=5e-6)
     np.testing.assert_allclose(index("water", 0.5875618), 1.3334, atol=5e-5)
     assert find_glass("water").range == (0.182, 1.129)
 
 
 def test_more_terms_of_one_medium_change_no_other():
-    """N-BK7 beside water has padded terms and the same index to the last digit."""
+    """In a lens with water, N-BK7 has padded terms and the same index to the last digit."""
     media = Dispersion.of([find_glass(name) for name in ("water", "N-BK7", "SK16", "air")])
     assert media.strength.shape == (4, 4)
     n = refractive_index(media, jnp.array([0.45, 0.65]))
@@ -99,7 +99,7 @@ def test_unknown_glass_lists_near_names(name, near):
 
 @pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
 def test_range_of_the_glasses_is_known_inside_a_trace(dtype):
-    """SK16: 0.4 to 0.7 um, its ends included in either precision; F2 begins at 0.32 um."""
+    """SK16 has 0.4 to 0.7 um, both ends included in float32 and float64; F2 starts at 0.32 um."""
     media = Dispersion.of([find_glass(name) for name in ("air", "F2", "SK16")])
     assert media.range == (0.4, 0.7)
     w = jnp.array([0.1, 0.4, 0.55, 0.7, 0.71, jnp.nan, -0.5], dtype)
@@ -124,7 +124,7 @@ def test_without_a_glass_any_wavelength_but_zero_will_do(dtype):
 
 LINES = 0.5875618, 0.4861327, 0.6562725, 0.4358343  # d, F, C, g
 BETWEEN = np.linspace(0.45, 0.65, 41)
-# Glasses of every family, and the largest error of n that the documentation tells.
+# Glasses of every family, and the largest error of n in the documentation.
 FAMILIES = {
     **dict.fromkeys(("N-BAF4", "N-SSK5", "LLF1", "N-KF9"), 3e-5),
     **dict.fromkeys(("N-BK7", "N-BAK4", "N-K5", "N-SK16", "F2", "N-PSK53A", "N-BASF2"), 7e-5),
@@ -136,7 +136,8 @@ FAMILIES = {
 
 @pytest.mark.parametrize("name", FAMILIES)
 def test_a_model_glass_beside_the_catalogue(name):
-    """The same nd and vd, exactly; n between 0.45 and 0.65 um within what is documented."""
+    """It has exactly the same nd and vd; n between 0.45 and 0.65 um agrees within the documented
+    error."""
     d, f, c, _ = index(name, *LINES)
     model = Dispersion.of([model_glass(float(d), float((d - 1) / (f - c))), find_glass(name)])
     at = np.asarray(refractive_index(model, jnp.array(LINES)))
@@ -148,7 +149,7 @@ def test_a_model_glass_beside_the_catalogue(name):
 
 
 def test_derivatives_of_a_model_glass():
-    """By nd and vd, from differences; and the partial dispersion of the normal line."""
+    """By nd and vd, compared with differences; and the partial dispersion of the normal line."""
     model = Dispersion.of([model_glass(1.83481, 42.7)])
     _, f, c, g = np.asarray(refractive_index(model, jnp.array(LINES)))[0]
     np.testing.assert_allclose((g - f) / (f - c), 0.6438 - 0.001682 * 42.7, rtol=1e-11)
@@ -169,7 +170,7 @@ def test_impossible_model_glasses(nd, vd):
 
 
 def solids():
-    """nd and vd of the catalogue but for air and water, by `index`."""
+    """nd and vd of all solids of the catalogue, by `index`."""
     plain = [name for name, entries in _table().items() if entries[0].plain]
     names = [name for name in plain if name not in ("air", "water")]
     lines = np.array([index(name, *LINES[:3]) for name in names])
@@ -177,8 +178,8 @@ def solids():
 
 
 def test_distance_to_the_glass_map():
-    """That of all lines through two glasses that have every glass on one side: 0 or less for all
-    glasses, above 0 where no glass is."""
+    """The distance from all lines through two glasses that have every glass on one side: 0 or less
+    for all glasses, above 0 in regions without glasses."""
     glasses = solids()
     scaled = np.unique(glasses * [1, 0.01], axis=0)
     ways = scaled[None] - scaled[:, None]
@@ -200,8 +201,8 @@ def test_distance_to_the_glass_map():
 
 @pytest.mark.slow
 def test_catalogue_glasses_made_model_glasses(tmp_path):
-    """nd and nF - nC, so focal lengths at d, F - C stay; spots change by what a model glass is off;
-    their nd and vd are leaves."""
+    """nd and nF - nC do not change, so that focal lengths at d and F - C stay; spots change by the
+    error of a model glass; nd and vd are leaves."""
     lens = drt_jax.load_lens("double_gauss")
     model = drt_jax.with_model_glass(lens)
     before, after = (np.asarray(each.index(LINES[:3])) for each in (lens, model))
@@ -231,7 +232,7 @@ def test_catalogue_glasses_made_model_glasses(tmp_path):
 
 
 def test_a_lens_of_arrays_of_numpy_exchanges_glasses():
-    """A model glass beside a real one, and a real one in its place."""
+    """A lens with a model glass and a real one; and a real one in place of the model glass."""
     lens = jax.tree.map(np.asarray, drt_jax.load_lens("double_gauss"))
     first = next(i for i, glass in enumerate(lens.glasses[1:]) if glass != "air")
     model = jax.tree.map(np.asarray, drt_jax.with_model_glass(lens, [first]))
@@ -241,7 +242,7 @@ def test_a_lens_of_arrays_of_numpy_exchanges_glasses():
 
 
 def test_some_glasses_made_model_glasses(tmp_path):
-    """Of a stop inside a glass both sides; the others stay as they are."""
+    """For a stop inside a glass the media on both sides; the others do not change."""
     lens = drt_jax.load_lens("cooke_triplet")
     one = drt_jax.with_model_glass(lens, (2,))
     assert [name.startswith("model ") for name in one.glasses] == [i == 3 for i in range(7)]

@@ -1,4 +1,5 @@
-"""The table of the makers' glasses, against indices that OpticStudio lists and makers' data."""
+"""The table of the makers' glasses, compared with indices in OpticStudio's listings and with
+makers' data."""
 
 import time
 
@@ -56,8 +57,8 @@ PRINTED = {
 
 
 def test_nd_and_vd_that_the_makers_print():
-    """By JAX's formula, beside each other, so with the longest of Schott's sums; of Schott's own,
-    P_gF of their sheets too."""
+    """By JAX's formula for all glasses together, therefore with the longest of Schott's sums; for
+    Schott's own glasses also P_gF of their sheets."""
     media = Dispersion.of([find_glass(name) for name in PRINTED])
     assert media.schott.shape == (8, 9)
     d, f, c, g = np.asarray(refractive_index(media, jnp.array([D, F, C, G]))).T
@@ -79,7 +80,7 @@ def test_the_longer_sum_is_finite_everywhere():
 
 
 def test_a_name_means_one_glass_or_asks():
-    """SK16 is Hikari's where no maker is given, never N-SK16; SCHOTT's has the same constants."""
+    """SK16 without a maker is Hikari's, never N-SK16; SCHOTT's has the same constants."""
     new, old, plain = (find_glass(name) for name in ("N-SK16", "SK16_SCHOTT", "SK16"))
     assert (old.sellmeier, old.name, plain.maker) == (new.sellmeier, "SK16_SCHOTT", "HIKARI")
     assert plain.schott != old.schott and find_glass("SK16", "schott") == old
@@ -116,8 +117,9 @@ def test_nearest_glasses():
 
 
 def test_temperature_expansion_and_status():
-    """Of data sheets: SCHOTT's of N-BK7, Ohara's of S-FPL51 (expansion 131e-7/K, at 25 C); and what
-    SCHOTT no longer lists, as N-LASF31, which N-LASF31A replaced, or sells on inquiry."""
+    """From data sheets: SCHOTT's of N-BK7, Ohara's of S-FPL51 (expansion 131e-7/K, at 25 C); and
+    glasses that SCHOTT no longer lists, such as N-LASF31, which N-LASF31A replaced, or sells on
+    inquiry."""
     glass = find_glass("N-BK7")
     assert glass.thermal == (1.86e-6, 1.31e-8, -1.37e-11, 4.34e-7, 6.27e-10, 0.17)
     assert (glass.expansion, glass.celsius, glass.status) == (7.1, 20.0, "preferred")

@@ -1,4 +1,4 @@
-"""Surfaces put in and taken out change no ray that they should not."""
+"""Surfaces that are inserted and removed change no ray that they should not change."""
 
 import dataclasses
 
@@ -81,7 +81,7 @@ def test_derivatives_go_through_a_pair():
 
 
 def test_what_a_lens_carries_goes_along():
-    """Apertures, phases and elements of a lens file keep their surfaces."""
+    """Apertures, phases and elements of a lens file stay at their surfaces."""
     lens = drt_jax.load_lens("hubble")
     plate = drt_jax.find_glass("N-BK7")
     more = design.inserted(lens, lens.count - 1, plate)
@@ -144,7 +144,7 @@ def test_what_cannot_be_done_is_refused(change, told):
 
 
 def test_a_lens_in_float32_stays_so():
-    """Also in a process of float64, for glasses of the catalogue."""
+    """Also in a process with float64, for glasses of the catalogue."""
     small = jax.tree.map(lambda a: a.astype(jnp.float32), drt_jax.load_lens("cooke_triplet"))
     found = design.inserted(small, 1, drt_jax.find_glass("N-BK7"))
     assert {leaf.dtype for leaf in jax.tree.leaves(found)} == {jnp.dtype("float32")}

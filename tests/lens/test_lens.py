@@ -67,7 +67,7 @@ def test_one_compilation_serves_lenses_of_one_shape():
 
 
 def test_a_lens_meets_the_one_before_in_a_program():
-    """What a program puts in makes another type of pytree, but for what `free` names."""
+    """Replacing an array makes another type of pytree, except for arrays that `free` names."""
 
     @jax.jit
     def change(lens):

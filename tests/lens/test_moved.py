@@ -1,4 +1,5 @@
-"""What a gradient by a whole lens moves, and what an optimiser leaves as it is: air stays air."""
+"""Numbers that a gradient by a whole lens changes, and those that an optimiser leaves unchanged:
+air stays air."""
 
 import dataclasses
 
@@ -30,8 +31,8 @@ MIXED = {
 
 
 def power(lens):
-    """Sum of the powers of all surfaces, 1/mm, over the size of the stop, and of all else that is
-    held: every number has a derivative where none is held."""
+    """Sum of the powers of all surfaces, 1/mm, divided by the size of the stop and by all other
+    held numbers, so that every number has a derivative if none is held."""
     bends = jnp.sum(jnp.diff(lens.index(GREEN)[:, 0]) * lens.curvature[:-1])
     if lens.phase is not None:
         bends = bends + jnp.sum(lens.phase.order[:, None] * lens.phase.coefficients)
@@ -45,7 +46,7 @@ slopes = jax.jit(jax.grad(power))
 
 
 def held(gradient):
-    """The numbers that a designer would not move."""
+    """The numbers that a designer would not change."""
     model = gradient.dispersion.model
     rest = [] if model is None else [model[0], *model[2:]]  # medium 1 alone is a model glass
     order = [] if gradient.phase is None else [gradient.phase.order]
@@ -77,7 +78,8 @@ def test_a_gradient_by_a_lens_holds_what_a_designer_holds(prescription):
 
 
 def test_what_is_asked_for_by_name_has_its_derivative():
-    """By replacement, in and outside of `jit`, and by the field `free`; against closed forms."""
+    """By replacement, in and outside of `jit`, and by the field `free`; compared with closed
+    forms."""
     stop, semi, constants = LENS.stop, LENS.semi_diameter, LENS.dispersion
     wanted = (semi[0] - power(LENS)) / semi[stop]
     bends = (LENS.sensor - LENS.thickness[0]) / semi[stop]
@@ -153,7 +155,7 @@ def test_check_refuses_nan_and_air_that_is_none(tmp_path):
 
 
 def test_a_mask_of_a_tree_of_parameters():
-    """As of a training step: a lens beside other parameters."""
+    """As in a training step: a lens together with other parameters."""
     lens = drt_jax.load_lens("cooke_triplet")
     mask = movable({"optics": lens, "network": [jnp.ones(3)]})
     assert mask["network"] == [True] and mask["optics"].curvature is True

@@ -1,4 +1,5 @@
-"""First-order data against closed forms and Fermat rays; gradients of first and third order."""
+"""First-order data compared with closed forms and Fermat rays; gradients of first and third
+order."""
 
 import dataclasses
 
@@ -35,8 +36,8 @@ image_height = jax.jit(image_height)
 
 
 def thin(gap=None, radius=25.0):
-    """Plano-convex singlet without thickness, n = 1.5: f = 2 R in air. The stop is
-    its plane or, given a gap, another plane before (+) or behind it (-)."""
+    """Plano-convex singlet without thickness, n = 1.5: f = 2 R in air. The stop is its plane or,
+    given a gap, another plane in front (+) or behind it (-)."""
     stop = {"curvature": 0, "semi_diameter": 2.0, "stop": True}
     glass = {"radius": radius, "index": 1.5}
     plane = {"curvature": 0}
@@ -69,8 +70,8 @@ def test_pupils_of_a_thin_lens():
 
 @pytest.mark.parametrize("gap", [20.0, 0.0, -2.0])
 def test_exit_pupil_while_the_stop_slides_through_the_lens(gap):
-    """f = 50: a stop at `gap` mm before the lens, or behind it where the light would be if there
-    were no lens, is imaged to 50 gap / (gap - 50), 50 / (50 - gap) its size."""
+    """f = 50: a stop at `gap` mm in front of the lens, or behind it at the position of the light
+    without the lens, is imaged to 50 gap / (gap - 50), 50 / (50 - gap) its size."""
     lens = thin(20.0)
     lens = dataclasses.replace(lens, thickness=lens.thickness.at[0].set(gap))
     pupil = exit_(lens, GREEN)
@@ -80,7 +81,7 @@ def test_exit_pupil_while_the_stop_slides_through_the_lens(gap):
 
 
 def test_first_order_of_a_stop_that_touches_the_lens(shared):
-    """P01: the numbers that OpticStudio prints, a stop plane at 0 mm before R = 20."""
+    """P01: the numbers of OpticStudio's listing, for a stop plane 0 mm in front of R = 20."""
     case = yaml.safe_load((shared / "psf_cases.yaml").read_text())["cases"][0]
     wanted = case["reference"]["first_order"]
     stop, front, back = case["prescription"]["surfaces"]
@@ -127,7 +128,7 @@ def test_telecentric_pupils_are_infinite_and_have_no_nan():
 
 @pytest.mark.slow
 def test_pupils_are_where_fermat_chief_rays_cross_the_axis():
-    """A chief ray at 1e-4 rad: third order leaves 1e-8 of the distance."""
+    """A chief ray at 1e-4 rad: third-order aberrations are 1e-8 of the distance."""
     lens = load_lens("cooke_triplet")
     rays = trace_rays(lens, Scene.point(1e-4, np.inf, RGB), [[0.0, 0.0]])
     points = np.asarray(rays.points[:, 0])
@@ -193,7 +194,7 @@ CASSEGRAIN = {
 
 
 def test_cassegrain():
-    """Primary f 500, secondary 125 mm before its focus, m = 4: focus 500 mm behind the
+    """Primary f 500, secondary 125 mm in front of its focus, m = 4: focus 500 mm behind the
     secondary, focal length 2000; 1/f of the second is 1/125 - 1/500."""
     lens = load_lens(CASSEGRAIN)
     first = first_order(lens, np.inf, GREEN)
@@ -233,8 +234,8 @@ IMMERSED = {
 
 @pytest.mark.slow
 def test_image_space_in_water():
-    """A thick lens before water: n' / f' is the power, and the Fermat rays end where Snell's do
-    and, near the axis, in the paraxial focus."""
+    """A thick lens in front of water: n' / f' is the power. Fermat rays end where Snell's do and,
+    close to the axis, in the paraxial focus."""
     surfaces = [
         {"radius": 30, "glass": "N-BK7", "thickness": 6.0, "semi_diameter": 8.0, "stop": True},
         {"radius": -40, "glass": "water"},
@@ -269,7 +270,7 @@ def test_image_space_in_water():
 
 @pytest.mark.slow
 def test_gradients_batches_and_one_program_for_all():
-    """Gradients against central differences of the fourth order, to 1e-6, all in one vmap."""
+    """Gradients agree with central differences of the fourth order to 1e-6, all in one vmap."""
     lens = freed(load_lens(IMMERSED))
 
     def terms(lens):

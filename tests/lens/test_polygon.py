@@ -1,4 +1,4 @@
-"""Convex pieces of polygons and depths inside of them, against areas and the nearest of many
+"""Convex pieces of polygons and depths inside of them, compared with areas and the nearest of many
 points."""
 
 import jax.numpy as jnp
@@ -38,7 +38,8 @@ def test_pieces_are_convex_and_fill_the_polygon(name):
 
 
 def test_depth_is_the_distance_from_the_sides():
-    """Of points all over; inside by the sum of the angles under which the sides are seen."""
+    """For points everywhere; the sum of the angles of the sides as seen from a point shows whether
+    it is inside."""
     corners = np.array(SHAPES["comb"], float)
     centre = np.array([0.3, -0.4])
     one = Apertures(

@@ -1,4 +1,4 @@
-"""Scenes: their makers, and points of any shape as the first axes of results."""
+"""Scenes: functions that make them, and points of any shape as the first axes of results."""
 
 import jax
 import jax.numpy as jnp
@@ -14,7 +14,7 @@ RGB = (0.6, 0.53, 0.48)
 
 
 def test_the_makers():
-    """One point has no axis, F fields have one, every field at every distance two."""
+    """One point has no axis, F fields have one, every field at every distance has two."""
     one = Scene.point((0.1, 0.2), 500.0, 0.55)
     assert one.shape == () and one.wavelengths.shape == (1,) and one.field.tolist() == [0.1, 0.2]
     assert Scene.point(0.1, (500.0, np.inf)).shape == (2,)
@@ -31,14 +31,14 @@ def test_the_makers():
 
 
 def test_known_numbers_stay_known_inside_jit():
-    """The rule follows from them there, too, if the lens is known."""
+    """Inside `jit`, too, the rule follows from the fields if the lens is known."""
     spot = lambda: drt_jax.psf_moments(LENS, Scene.point(0.05, np.inf, 0.55), 1e-3)  # noqa: E731
     np.testing.assert_allclose(jax.jit(spot)().covariance, spot().covariance, rtol=1e-12)
 
 
 @pytest.mark.slow
 def test_points_of_any_shape_are_the_first_axes():
-    """Each result is that of its own point, eagerly and compiled."""
+    """Each result is that of its point alone, outside of `jit` and inside."""
     grid = Scene.grid([0.0, 0.05, 0.1], (700.0, np.inf), RGB)
     pairs = Scene.radians([[0.02, 0.05], [0.0, 0.1]], (700.0, 900.0), RGB)
 
@@ -57,7 +57,7 @@ def test_points_of_any_shape_are_the_first_axes():
 @pytest.mark.slow
 @pytest.mark.parametrize("how", [lambda call: call, jax.jit])
 def test_points_of_moments_are_the_first_axes(how):
-    """The same of spots."""
+    """The same for spots."""
     scene = Scene.grid([0.0, 0.05, 0.1], (700.0, np.inf), RGB)
     spot = lambda scene: drt_jax.psf_moments(LENS, scene, Gauss(2, "none"))  # noqa: E731
     every, alone = how(spot)(scene), [spot(one) for one in scene.each()]

@@ -1,4 +1,4 @@
-"""Third-order aberrations against real rays near the axis and closed forms."""
+"""Third-order aberrations compared with real rays near the axis and closed forms."""
 
 import dataclasses
 
@@ -43,9 +43,9 @@ LONG = ("immersed", "mangin")
     "name", [pytest.param(n, marks=pytest.mark.slow) if n in LONG else n for n in THIRD]
 )
 def test_third_order_is_what_real_rays_show_near_the_axis(name):
-    """Errors in the paraxial image plane of real rays, whose aperture and field shrink together
-    by t: over t^3, and with its t^2 removed, they are the polynomial of the Seidel sums. What
-    is left is t^4 of them, 1e-4."""
+    """Errors of real rays in the paraxial image plane, divided by t^3, where t scales aperture and
+    field. Without their term of t^2 they are the polynomial of the Seidel sums. The remaining error
+    is proportional to t^4, 1e-4."""
     source, distance = THIRD[name]
     lens = load_lens(source)
     sums = third_order(lens, Scene.point(0.1, distance, GREEN)).total
@@ -74,8 +74,8 @@ def test_third_order_is_what_real_rays_show_near_the_axis(name):
 
 
 def test_third_order_of_stigmatic_surfaces_and_of_the_mirror():
-    """The Cassegrain of paraboloid and hyperboloid has no spherical aberration, its surfaces
-    none by themselves; Petzval's sum takes the mirrors with opposite signs."""
+    """The Cassegrain of paraboloid and hyperboloid has no spherical aberration, nor has either
+    surface alone. In Petzval's sum the mirrors have opposite signs."""
     parts = third_order(load_lens(CASSEGRAIN), Scene.point(0.01, np.inf, GREEN))
     np.testing.assert_allclose(parts.spherical[0], 0, atol=1e-15)
     # k of the secondary for magnification 4: -((m + 1) / (m - 1))^2 = -25/9, not -4
@@ -89,7 +89,8 @@ def test_third_order_of_stigmatic_surfaces_and_of_the_mirror():
 
 
 def test_third_order_knows_the_stop_by_its_images_only():
-    """A stop in front of a lens, and its exit pupil taken as a stop that is listed behind."""
+    """A stop in front of a lens, compared with its exit pupil as a stop that is listed behind the
+    lens."""
     lens = [
         {"radius": 30, "glass": "N-BK7", "thickness": 4.0},
         {"radius": -70, "conic": -0.5, "coefficients": {4: 1e-6}},
@@ -128,7 +129,8 @@ def test_third_order_needs_an_axis():
 
 @pytest.mark.slow
 def test_third_order_is_that_of_a_centred_lens():
-    """A known tilt is refused, and infinite inside a trace; arrays of zeros are no tilt."""
+    """A known tilt raises an error; inside a trace the result is infinite. Arrays of zeros are no
+    tilt."""
     lens = load_lens("singlet")
     for name, still in (("tilt", np.zeros((4, 3))), ("decentre", np.zeros((4, 2)))):
         moved = still.copy()

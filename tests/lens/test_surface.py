@@ -1,4 +1,4 @@
-"""The sag against closed forms, its derivatives against 40-digit differences."""
+"""The sag compared with closed forms, its derivatives with 40-digit differences."""
 
 import jax
 import jax.numpy as jnp
@@ -72,7 +72,7 @@ def exact_qbfs(x, y, c, k, a):
 
 
 def exact_zernike(x, y, c, k, a):
-    """Z_1 to Z_11 as Noll (1976) lists them."""
+    """Z_1 to Z_11 as listed by Noll (1976)."""
     radius, *rest = a
     rho, theta = mpmath.sqrt(x**2 + y**2) / radius, mpmath.atan2(y, x)
     root = mpmath.sqrt
@@ -92,7 +92,7 @@ def exact_zernike(x, y, c, k, a):
     return conic(x**2 + y**2, c, k) + sum(v * f for v, f in zip(rest, z))
 
 
-# form, curvature, conic, coefficients: one line for each shape that everything below runs over.
+# form, curvature, conic, coefficients: one line for each shape of the tests below.
 SHAPES = {
     "plane": ("asphere", 0.0, 0.0, []),
     "sphere": ("asphere", 1 / 50, 0.0, []),
@@ -240,7 +240,7 @@ def test_flagged_beyond_the_rim(dtype):
 
 
 def test_forbes_polynomials_on_a_hyperboloid_are_those_of_another_program():
-    """Sags of a Qbfs surface, as Zemax prints them."""
+    """Sags of a Qbfs surface in a listing of Zemax."""
     a = [6.336, 1.614, 0.348, 0.15, 0.033, 0.03]
     shape = Shape(jnp.asarray(1 / 21.723), jnp.asarray(-4.428), jnp.asarray(a))
     z = surface_sag((jnp.zeros(2), jnp.array([0.75, 1.86])), shape, "qbfs")
@@ -248,8 +248,8 @@ def test_forbes_polynomials_on_a_hyperboloid_are_those_of_another_program():
 
 
 def test_slopes_of_forbes_polynomials_are_orthonormal():
-    """About a sphere, by the weight 1 / (u sqrt(1 - u^2)) over the disc (Forbes 2007, Eq. 11): the
-    slope along the normal of u^2 (1 - u^2) Q_m is orthonormal. 24 terms, by Gauss-Chebyshev."""
+    """On a sphere, with the weight 1 / (u sqrt(1 - u^2)) over the disc (Forbes 2007, Eq. 11), the
+    slopes along the normal of u^2 (1 - u^2) Q_m are orthonormal. 24 terms, by Gauss-Chebyshev."""
     count, order = 24, 200
     u = np.cos(np.pi * (2 * np.arange(order) + 1) / (4 * order))  # u > 0, weights pi / (2 order)
     unit = Shape(*(jnp.zeros((count, 1)),) * 2, np.insert(np.eye(count), 0, 1, axis=0)[..., None])
@@ -259,7 +259,7 @@ def test_slopes_of_forbes_polynomials_are_orthonormal():
 
 
 def test_zernike_polynomials_are_orthonormal():
-    """All 91 that files may give, over the disc, to the rounding of their polynomials in x, y."""
+    """All 91 that files may have, over the disc, to the rounding of their polynomials in x, y."""
     count = 91
     points, weights = disc(14, 14)
     unit = Shape(*(jnp.zeros((count, 1)),) * 2, np.insert(np.eye(count), 0, 1, axis=0)[..., None])
@@ -273,7 +273,7 @@ def test_zernike_polynomials_are_orthonormal():
 
 
 def test_toroid_of_another_program(shared):
-    """Sags that Zemax gives, quoted to 16 digits in Optiland's tests."""
+    """Sags of Zemax, quoted to 16 digits in Optiland's tests."""
     cases = yaml.safe_load((shared / "reference_cases.yaml").read_text())["cases"]
     case = next(c for c in cases if c["id"] == "C13_toroid_1_zemax")
     shape = Shape(jnp.array(1 / 50), jnp.array(-0.5), jnp.array([1 / 100, 1e-5, 0.0]))

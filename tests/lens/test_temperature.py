@@ -101,7 +101,7 @@ def test_aspheric_terms_that_opticstudio_picks_up():
 
 
 def test_focal_length_of_a_thin_lens():
-    """f / f0 = k (n0 - 1) / (n - 1) of a thin lens, k its growth."""
+    """f / f0 = k (n0 - 1) / (n - 1) for a thin lens with the expansion factor k."""
     lens = singlet("N-BK7", 100.0, 1e-6)
     model = ThermalModel.from_lens(lens)
 
@@ -121,7 +121,7 @@ def test_focal_length_of_a_thin_lens():
 
 
 def test_air_spaces_between_rims():
-    """Rims of two spheres, held apart by a tube that grows along and across the axis."""
+    """Rims of two spheres, held apart by a tube that expands along and across the axis."""
     lens = load_lens("double_gauss")
     celsius, mounts = 70.0, 20.0
     hot = at_temperature(lens, celsius, ThermalModel.from_lens(lens, mounts))
@@ -143,7 +143,7 @@ def test_air_spaces_between_rims():
     solid = np.array(solid)
     thick = lens.thickness * grow[:-1]
     np.testing.assert_allclose(hot.thickness[solid], thick[solid], rtol=1e-14)
-    # The cemented surface grows like the glass behind it, the stop like the mount.
+    # The cemented surface expands like the glass behind it, the stop like the mount.
     tube = 1 + 50e-6 * mounts
     factors = [*grow[[0, 0, 2, 3, 3]], tube, *grow[[6, 7, 7, 9, 9]], tube]
     np.testing.assert_allclose(hot.semi_diameter, lens.semi_diameter * np.array(factors))
@@ -159,7 +159,7 @@ def test_a_telescope_of_one_metal_only_grows():
 
 
 def test_parts_grow_with_what_holds_them():
-    """A grating keeps its number of lines, apertures grow with their surface, places with the
+    """A grating keeps its number of lines, apertures expand with their surface, positions with the
     mount."""
     surface = {"radius": 50, "glass": "N-BK7", "thickness": 4, "stop": True, "semi_diameter": 5}
     surface |= {"phase": {"form": "linear", "order": 1, "coefficients": {"y": 100}}}

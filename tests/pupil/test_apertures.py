@@ -1,4 +1,5 @@
-"""Apertures of other shapes, and obscurations, against areas, geometry and sums of many rays."""
+"""Apertures of other shapes, and obscurations, compared with areas, geometry and sums of many
+rays."""
 
 import dataclasses
 import itertools
@@ -26,7 +27,7 @@ R = 2.0
 
 
 def beam(**keys):
-    """A plane wave goes through a stop and on: the spot is the aperture."""
+    """A plane wave passes a stop and continues: the spot is the aperture."""
     stop = {"radius": "inf", "semi_diameter": R, "stop": True, **keys}
     return load_lens(
         {"surfaces": [{"radius": "inf", "thickness": 2.0, "index": 1.5}, stop], "sensor": 4.0}
@@ -57,8 +58,8 @@ def test_light_and_spot_of_a_clear_aperture(name):
 
 @pytest.mark.slow
 def test_light_past_a_ring_and_a_bar():
-    """A hole and a bar across: area and variances of the disc less those of both, more those of
-    what they share; their integrals over x in closed form or by a dense rule."""
+    """A central obscuration and a bar across: area and variances of the disc minus those of both,
+    plus those of their overlap; integrals over x in closed form or by a dense rule."""
     hole, bar = 0.66, 0.04
     lens = beam(obscuration=[{"circle": hole}, {"rectangle": [bar, 3.0]}])
     found = focus_moments(lens, Scene.point(0.0, jnp.inf, GREEN), sampling=Clipped(12, "bilateral"))
@@ -82,7 +83,7 @@ def test_no_light_passes_an_obscuration_that_hides_the_stop():
         focus_moments(lens, Scene.point(0.0, jnp.inf, GREEN), sampling=Clipped(12, "bilateral"))
 
 
-# An ellipse before the lens, a bar and a disc on a stop behind it that bends no light.
+# An ellipse in front of the lens, a bar and a disc on a stop behind it that bends no light.
 CUT = {
     "surfaces": [
         {
@@ -139,7 +140,7 @@ def test_agrees_with_many_rays_that_drop_out(cut):
 
 @pytest.mark.slow
 def test_derivatives_by_sizes_and_centres(cut):
-    """Forward and reverse, in jit and vmap, against fourth-order differences."""
+    """Forward and reverse mode, in jit and vmap, compared with fourth-order differences."""
     many = jax.jit(jax.vmap(blur))
     of = lambda apertures: blur(dataclasses.replace(cut, apertures=apertures))  # noqa: E731
     change = jax.tree.map(lambda a: jnp.cos(jnp.arange(a.size)).reshape(a.shape), cut.apertures)
@@ -172,8 +173,8 @@ def test_derivatives_by_sizes_and_centres(cut):
 
 @pytest.mark.slow
 def test_a_telescope_with_a_hole():
-    """On axis and 5 arc minutes beside it: light, focal length, and the spot of a rule on the ring
-    that knows where it is; the error falls with the order as on a disc."""
+    """On axis and at 5 arc minutes: throughput, focal length, and the spot compared with a rule on
+    the known ring. The error decreases with the order as on a disc."""
     lens = load_lens("hubble")
     np.testing.assert_allclose(drt_jax.focal_length(lens, GREEN), 57600, rtol=1e-5)
     assert drt_jax.pupil.symmetry_of(lens, 0.0) == "rotational"
@@ -235,8 +236,9 @@ def test_symmetry():
 
 
 def inside_of(corners, radius):
-    """Area and integrals of x and y of a polygon (N, 2) within a circle, by Green's theorem: along
-    its sides, and along the arcs between, each a ray from the centre apart."""
+    """Area and integrals of x and y of the part of a polygon (N, 2) inside a circle, by Green's
+    theorem along its sides and along the arcs between them. The sides are cut where they cross the
+    circle."""
     total, nodes, weights = np.zeros(3), *np.polynomial.legendre.leggauss(40)
     for a, b in zip(corners, np.roll(corners, -1, axis=0)):
         d = b - a
@@ -259,7 +261,7 @@ def inside_of(corners, radius):
 
 
 def seen_through(corners):
-    """Share of the light and its mean on the stop, behind an L with a triangle in it."""
+    """Throughput and mean position on the stop, behind an L with a triangle in it."""
     outer, inner = (inside_of(c, R) for c in corners)
     total = outer - inner
     return np.append(total[0] / (np.pi * R**2), total[1:] / total[0])
@@ -267,8 +269,9 @@ def seen_through(corners):
 
 @pytest.mark.slow
 def test_polygons_whole_and_with_inward_corners():
-    """An L that the rim cuts, decentred, and a triangle across the line between its pieces; light,
-    mean, and how they move with all corners, by differences of closed forms."""
+    """A decentred L that the rim clips, and a triangle across the line between its pieces:
+    throughput, mean, and their derivatives by all corners, compared with differences of closed
+    forms."""
     shift = np.array([0.1, -0.2])
     outer = np.array([[-1.5, -1.0], [2.6, -1.2], [2.5, 0.2], [0.1, 0.0], [0.0, 2.2], [-1.4, 1.9]])
     inner = np.array([[-0.9, -0.6], [0.7, -0.8], [-0.9, 0.7]])

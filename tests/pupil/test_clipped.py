@@ -1,4 +1,4 @@
-"""The pupil that clear apertures leave, against geometry and brute force."""
+"""The pupil that clear apertures leave, compared with geometry and sums of many rays."""
 
 import dataclasses
 
@@ -18,7 +18,7 @@ FAR = 25000.0
 
 
 def clipped(front, rear):
-    """The Double Gauss, its front and rear apertures made smaller."""
+    """The Double Gauss with smaller front and rear apertures."""
     lens = load_lens("double_gauss")
     semi = lens.semi_diameter.at[0].set(front).at[10].set(rear)
     return freed(dataclasses.replace(lens, semi_diameter=semi))
@@ -42,8 +42,8 @@ def found(name, order):
 
 @pytest.mark.slow
 def test_overlap_of_two_discs():
-    """What two shifted discs have in common: area, centroid and second moments in closed form,
-    here from a dense integral over y of the chord (a substitution makes it smooth)."""
+    """The overlap of two shifted discs: area, centroid and second moments in closed form, here from
+    a dense integral over y of the chord (with a substitution that makes it smooth)."""
     lens = load_lens(
         {
             "surfaces": [
@@ -92,7 +92,8 @@ def test_converges_like_an_open_pupil(name):
 
 @pytest.mark.slow
 def test_agrees_with_many_rays_that_drop_out():
-    """A grid of 300 x 300 rays, those that are clipped left out: as good as its pixels."""
+    """A grid of 300 x 300 rays without those that are clipped: they agree within the error of the
+    grid."""
     field, lens = SCENES["front and rear"]
     side = np.linspace(-1, 1, 301)
     grid = np.stack(np.meshgrid(side, side), axis=-1).reshape(-1, 2)
@@ -112,7 +113,7 @@ def test_agrees_with_many_rays_that_drop_out():
     "name", ["on axis", pytest.param("front and rear", marks=pytest.mark.slow)]
 )
 def test_gradients_follow_the_boundary(name):
-    """Against fourth-order differences of the value, also to the semi-diameters themselves."""
+    """Compared with fourth-order differences of the value, also by the semi-diameters."""
     field, lens = SCENES[name]
     weights = jnp.array([1.0, 0.3, 0.3, 0.7])
     rule = Clipped(10, drt_jax.pupil.symmetry_of(lens, field))
@@ -149,7 +150,7 @@ def test_the_rule_that_a_clipped_scene_needs():
 
 @pytest.mark.slow
 def test_one_rule_for_a_clipped_field_and_the_axis():
-    """A clipped one, also where nothing is clipped."""
+    """It is a clipped rule, also for the field without clipping."""
     field, lens = SCENES["front"]
     rule = drt_jax.converge(
         drt_jax.psf_moments, lens, Scene.grid([[0.0, 0.0], [0.0, field]], FAR, GREEN), 1e-4
@@ -183,8 +184,8 @@ def test_soft_edge_tends_to_the_hard_one_and_has_gradients():
 
 @pytest.mark.slow
 def test_a_pupil_that_paraxial_optics_does_not_find():
-    """A fisheye at 85 degrees, its paraxial entrance pupil far from the real one: the nearest ray
-    of a fan leads all others, and the rule finds the stop, which nothing clips."""
+    """A fisheye at 85 degrees, whose paraxial entrance pupil is far from the real one: all rays
+    start from the nearest ray of a fan, and the rule finds the unvignetted stop."""
     lens, field, green = load_lens("fisheye_8mm"), np.radians(85.0), (0.55,)
     ours = psf_moments(lens, Scene.point(field, jnp.inf, green), sampling=Clipped(10, "bilateral"))
     theirs = psf_moments(lens, Scene.point(field, jnp.inf, green), sampling=Gauss(14, "bilateral"))
@@ -196,7 +197,7 @@ def test_a_pupil_that_paraxial_optics_does_not_find():
 
 @pytest.mark.slow
 def test_gradients_in_float32_are_those_in_float64():
-    """In reverse mode, where corners that do not exist have steps without bounds. Optimised machine
+    """In reverse mode, where the tangents of missing corners are unbounded. With optimised machine
     code, in which these were infinite."""
 
     def variance(lens):

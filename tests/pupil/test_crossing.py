@@ -1,5 +1,5 @@
-"""Where neighbouring surfaces cross, light ends as at a clear aperture: against closed forms and an
-integral over a trace by Snell's law."""
+"""Where neighbouring surfaces cross, light ends as at a clear aperture: compared with closed forms
+and an integral over a trace by Snell's law."""
 
 import dataclasses
 
@@ -17,19 +17,20 @@ GREEN = (0.55,)
 
 
 def wide(semi):
-    """A plano-convex lens without rims behind a stop of `semi` mm: its faces cross in a circle."""
+    """A plano-convex lens without rims behind a stop of `semi` mm: its surfaces cross in a
+    circle."""
     lens = load_lens("singlet")
     return dataclasses.replace(lens, semi_diameter=jnp.array([semi, jnp.inf, jnp.inf, jnp.inf]))
 
 
 def light(lens, field, rule):
-    """What part of the light on the stop passes."""
+    """The fraction of the light on the stop that passes."""
     return focus_moments(lens, Scene.point(field, jnp.inf, GREEN), sampling=rule).throughput[0]
 
 
 @pytest.mark.slow
 def test_on_axis():
-    """A circle of r^2 = 2 R t - t^2, its derivatives by curvature and thickness."""
+    """The circle has r^2 = 2 R t - t^2; its derivatives by curvature and thickness."""
     lens = wide(25.0)
     c, t = float(lens.curvature[1]), float(lens.thickness[1])
     passed, gradient = jax.value_and_grad(light)(lens, 0.0, Clipped(4, "rotational"))
@@ -39,7 +40,7 @@ def test_on_axis():
 
 
 def overlap(stop, field, curvature, thickness):
-    """The part of a stop that the circle leaves, seen from it under an angle: of two discs."""
+    """The part of a stop that the circle leaves at an angle: the overlap of two discs."""
     r = np.sqrt(2 * thickness / curvature - thickness**2)
     d = np.tan(field) * (2.0 + thickness)
     x = (d**2 + stop**2 - r**2) / (2 * d)  # of the chord
@@ -50,7 +51,8 @@ def overlap(stop, field, curvature, thickness):
 
 @pytest.mark.slow
 def test_off_axis():
-    """Two circles that overlap; derivatives by a complex step, in every mode, the second too."""
+    """Two overlapping circles; derivatives by a complex step, in every mode, also the second
+    ones."""
     lens, field = wide(18.0), 0.6
     rule = drt_jax.converge(drt_jax.psf_moments, lens, Scene.point(field, jnp.inf, GREEN), 1e-6)
     assert rule.order <= 8
@@ -84,8 +86,8 @@ def test_off_axis():
 
 @jax.jit
 def integral(lens, field):
-    """Light and spot size of a beam that ends where rays begin to fail, in polar coordinates on a
-    plane before the lens; the edge by bisection."""
+    """Throughput and spot size of a beam that ends where rays begin to fail, in polar coordinates
+    on a plane in front of the lens; its edge is found by bisection."""
     direction = jnp.stack([0 * field, jnp.sin(field), jnp.cos(field)])
     angle = 2 * np.pi * np.arange(64) / 64
     toward = jnp.stack([jnp.cos(angle), jnp.sin(angle)], axis=1)
@@ -124,8 +126,8 @@ def integral(lens, field):
 
 @pytest.mark.slow
 def test_a_thin_gap_inside_of_a_lens():
-    """The air between two lenses ends 7 mm off the axis: light and spot of a beam that is wider, at
-    a field, and how they change with the gap."""
+    """The air between two lenses ends 7 mm off the axis: throughput and spot of a wider beam at a
+    field, and their derivatives by the gap."""
     surfaces = [
         {"radius": 30.0, "thickness": 6.0, "index": 1.6, "semi_diameter": 4.0},
         {"radius": 60.0, "thickness": 0.3, "semi_diameter": 4.0},
@@ -157,7 +159,7 @@ def test_a_thin_gap_inside_of_a_lens():
 
 
 def test_crossings_are_sought_only_where_there_may_be_some():
-    """Not in camera lenses with rims on all surfaces: the search takes half the time."""
+    """Not in camera lenses with rims on all surfaces, which halves the time of the search."""
     assert not any(may_cross(load_lens(n)) for n in ("camera_50mm", "phone", "double_gauss"))
     assert may_cross(wide(25.0))
     tilted = dataclasses.replace(load_lens("singlet"), tilt=jnp.zeros((4, 3)).at[1, 0].set(0.01))

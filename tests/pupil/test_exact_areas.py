@@ -1,5 +1,5 @@
-"""What three overlapping obscurations leave of a disc: areas, means and variances, and how they
-move, by Green's theorem on the arcs and segments that bound it."""
+"""Areas, means and variances of a disc with three overlapping obscurations, and their derivatives,
+by Green's theorem on the arcs and segments of the boundary."""
 
 import itertools
 
@@ -26,8 +26,9 @@ KINDS = ("circle", "rectangle", "circle")
 
 
 def curves(kind, half, centre):
-    """The arcs of a shape: functions of t, 0 to 1, to points (2, T), normals (2, T), speeds (T,)
-    and how fast the edge goes outwards with each of two half widths and two centres (4, T)."""
+    """The arcs of a shape: functions of t, 0 to 1, that return points (2, T), normals (2, T),
+    speeds (T,) and the outward velocity of the edge for a change of each of two half widths and two
+    centres (4, T)."""
 
     def circle(t):
         normal = np.stack([np.cos(2 * np.pi * t), np.sin(2 * np.pi * t)])
@@ -47,13 +48,14 @@ def curves(kind, half, centre):
 
 
 def gaps(kind, half, centre, point):
-    """Functions of points (2, T) that change sign on a circle, or on the four lines of a side."""
+    """Functions of points (2, T) that change sign on a circle, or on the four lines of the
+    sides."""
     x, y = point - centre
     return [np.hypot(x, y) - half[0]] if kind == "circle" else [abs(x) - half[0], abs(y) - half[1]]
 
 
 def crossings(curve, shape):
-    """Where an arc meets a shape, by bisection."""
+    """Parameters at which an arc meets a shape, by bisection."""
     t, found = np.linspace(0, 1, 4001), []
     for k, gap in enumerate(gaps(*shape, curve(t)[0])):
         for i in np.flatnonzero((gap[1:] > 0) != (gap[:-1] > 0)):
@@ -67,8 +69,8 @@ def crossings(curve, shape):
 
 
 def integrals(shapes):
-    """Of 1, x, y, x^2, y^2 and x y inside of the first shape and outside of the others, (6,);
-    and their derivatives (6, shapes, 4) by half widths and centres."""
+    """Integrals of 1, x, y, x^2, y^2 and x y inside of the first shape and outside of the others,
+    (6,); and their derivatives (6, shapes, 4) by half widths and centres."""
     total, slopes = np.zeros(6), np.zeros((6, len(shapes), 4))
     for k, shape in enumerate(shapes):
         others = [(j, other) for j, other in enumerate(shapes) if j != k]
@@ -90,7 +92,7 @@ def integrals(shapes):
 
 
 def moments_of(integral):
-    """Share of the light, mean and covariance (xx, yy, xy) from the integrals."""
+    """Throughput, mean and covariance (xx, yy, xy) from the integrals."""
     area, x, y, xx, yy, xy = integral
     mean = x / area, y / area
     square = xx / area - mean[0] ** 2, yy / area - mean[1] ** 2, xy / area - mean[0] * mean[1]
@@ -99,7 +101,7 @@ def moments_of(integral):
 
 @jax.jit
 def found(lens, rule):
-    """The same of a lens, and the derivatives by its apertures and its stop."""
+    """The same for a lens, and the derivatives by its apertures and its stop."""
 
     def of(lens):
         moments = focus_moments(lens, Scene.point(0.0, jnp.inf, GREEN), sampling=rule)
@@ -112,8 +114,8 @@ def found(lens, rule):
 
 @pytest.mark.parametrize("name", CASES)
 def test_three_obscurations_that_overlap(name):
-    """Values within 1e-6, and derivatives within 1e-6 of the largest, by the rule that the spot
-    size needs for 1e-6."""
+    """Values within 1e-6, and derivatives within 1e-6 of the largest, by the rule for a spot size
+    to 1e-6."""
     plane = {"radius": "inf", "thickness": 2.0, "index": 1.5}
     stop = {"radius": "inf", "semi_diameter": R, "stop": True}
     stop["obscuration"] = [

@@ -1,5 +1,5 @@
-"""Masks in the stop: means over their pixels, light and moments of rays, and kernels by waves,
-against sums over fine grids in NumPy."""
+"""Masks in the stop: means over their pixels, throughput and moments of rays, and kernels by waves,
+compared with sums over fine grids in NumPy."""
 
 import jax
 import jax.numpy as jnp
@@ -25,7 +25,8 @@ def lens_of(phase=None, **more):
 
 
 def test_means_over_boxes():
-    """Of boxes up to the size of a pixel, also over the edges of the plate, by many points."""
+    """For boxes up to the size of a pixel, also across the edges of the plate, compared with many
+    points."""
     at, half = RNG.uniform(-1.1, 1.1, (2, 1, 50)), RNG.uniform(0, 0.5 / 4, (2, 1, 50))
     table = RNG.uniform(size=(4, 4)) + 1j * RNG.uniform(size=(4, 4))
     side = (np.arange(2000) + 0.5) / 1000 - 1
@@ -78,7 +79,7 @@ def test_light_and_middle_of_the_rays_of_a_mask():
 
 
 def fraunhofer(mask, pixel, size):
-    """What pixels collect of the light of plane waves of all directions from a perfect lens."""
+    """Light in the pixels from the plane waves of all directions of a perfect lens."""
     fine, sub = 1024, 6
     most = R / np.hypot(R, F)
     line = ((np.arange(fine) + 0.5) / fine * 2 - 1) * most
@@ -97,8 +98,8 @@ def fraunhofer(mask, pixel, size):
 
 @pytest.mark.slow
 def test_kernel_by_waves_of_a_coded_phase_plate():
-    """Amplitudes and paths at random, in `jit`: the kernel is Fraunhofer's, the light that of the
-    pixels on the disc, and the derivative by both that of differences."""
+    """Random amplitudes and paths, in `jit`: the kernel agrees with Fraunhofer's sum, the
+    throughput with the pixels on the disc, and the derivatives by both with differences."""
     lens, pixel, size = lens_of(phase=True), 0.004, 31
     model = Sampling("waves", beam_rule(8, "rotational"), 32)
     mask = Mask(jnp.asarray(CODE), jnp.asarray(RNG.uniform(0, 3e-4, (8, 8))))

@@ -45,7 +45,8 @@ def test_gauss_rule_is_exact_to_its_degree(order):
 
 @pytest.mark.parametrize("rings", [1, 8, 30])
 def test_hexapolar_rings_stand_for_equal_areas(rings):
-    """Each ring has the mean r^2 of its annulus; only the centre, of area 1 / Q, has 0 for it."""
+    """Each ring has the mean r^2 of its annulus, except the centre, of area 1 / Q, which has r =
+    0."""
     pattern = pupil.hexapolar(rings)
     count = 1 + 3 * rings * (rings + 1)
     assert pattern[1].size == count

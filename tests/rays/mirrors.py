@@ -17,8 +17,9 @@ def _along(angle, length, start=(0.0, 0.0)):
 
 
 def _confocal(second, third):
-    """A paraboloid, a hyperboloid and an ellipsoid that hand on one focus: on axis all rays meet.
-    The axes of the latter two are tilted by `second` and `third` degrees about the foci."""
+    """A paraboloid, a hyperboloid and an ellipsoid with common foci, each of which images the focus
+    of the one before: on axis all rays meet. The axes of the latter two are tilted by `second` and
+    `third` degrees about the foci."""
     focus = (0.0, -100.0)
     at = _along(second, 20.0, focus)
     focus = _along(second, 120.0, focus)
@@ -31,8 +32,8 @@ def _confocal(second, third):
     return mirrors, (*_along(third, -120.0, last), third)
 
 
-# Each mirror is used about its vertex, where the axial ray meets it: 30, 20 and 40 degrees to the
-# axis; the light between the second and the third is nearly parallel.
+# The axial ray meets each mirror at its vertex, at 30, 20 and 40 degrees to the axis; the light
+# between the second and the third is nearly parallel.
 _SECOND = 100 * math.sin(math.radians(30)), -100 * math.cos(math.radians(30))
 _THIRD = _along(-20.0, 110.0, _SECOND)
 ZIGZAG = (
@@ -45,8 +46,8 @@ ZIGZAG = (
 )
 SYSTEMS = {"coaxial": _confocal(0.0, 0.0), "tilted": _confocal(8.0, -6.0), "zigzag": ZIGZAG}
 
-# Of the confocal ones the light fills the part of the first mirror from 15 to 55 mm off its axis,
-# whose rim lies 7.6 mm in front of its vertex.
+# In the confocal systems the light fills the part of the first mirror from 15 to 55 mm off its
+# axis. The rim of this mirror lies 7.6 mm in front of its vertex.
 STOPS = {
     ("coaxial", "in front"): (0, 35.0, -60.0, 0.0, 20.0),
     ("coaxial", "at the vertex of the first mirror, behind its rim"): (0, 35.0, 0.0, 0.0, 20.0),

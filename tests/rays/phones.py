@@ -213,8 +213,8 @@ LENSES = {
 
 
 def load(name, position=None, place=0):
-    """A lens of the table. `place`: how many surfaces are listed before the stop, which lies
-    `position` mm behind the next one, by default where the table says."""
+    """A lens of the table. `place`: number of surfaces that are listed in front of the stop, which
+    lies `position` mm behind the next one; by default as in the table."""
     standard, f_number, back, rows = LENSES[name]
     surfaces = [
         {

@@ -13,7 +13,7 @@ from ..known import aims, bendable, known, search
 from .systems import COLOURS, lens_with
 
 POINTS = tuple(jnp.asarray(p) for p in ([0.0, 0.5, -0.3, 0.8, -0.9], [0.1, 0.6, -0.8, -0.2, 0.1]))
-# A mirror and a stop that bends light, all tilted; meridional rays and one that bends none.
+# A mirror and a stop that bends light, all tilted; and meridional rays with a stop that bends none.
 PROBLEMS = {"tilted": ("active", True, 2), "meridional": ("between", False, 1)}
 
 
@@ -39,7 +39,7 @@ def weighed(hits, weights):
 
 
 def outcome(lens, scene, points, found, weights):
-    """The scalar of rays that are known."""
+    """The scalar for known rays."""
     hits = known(found)(*aims(lens, scene, points)).hits
     return weighed(hits, weights)
 

@@ -1,4 +1,4 @@
-"""Small systems of every kind, and paths through them that are not yet rays."""
+"""Small systems of every kind, and trial paths through them."""
 
 import jax
 import jax.numpy as jnp
@@ -19,7 +19,7 @@ LIVE = [
 ]
 MIRROR = {"radius": -400, "conic": -1, "coefficients": {4: 1e-8}, "mirror": True, "thickness": -5}
 STOP = {"radius": -70, "conic": 0.3, "semi_diameter": 4.0, "stop": True}
-# Where the stop is: in the list of the surfaces, bending no light, or one of them.
+# Position of the stop: in the list of the surfaces, bending no light, or one that does.
 PLACES = {"in front": 0, "between": 2, "behind": None, "active": 2}
 
 
@@ -72,12 +72,12 @@ def scene_system(lens, distance=DISTANCE, dim=2):
 
 
 def meridional(lens, colours):
-    """The system of a lens for meridional rays, the object on the axis at infinity."""
+    """The system of a lens for meridional rays, with an axial object at infinity."""
     return _system_of(lens, checked_scene(lens, Scene.point(0.0, jnp.inf, colours)), 1)
 
 
 def rough_path(system, rays=3, seed=3):
-    """Hits, D arrays (R, W, Q) in mm, of paths that are no rays."""
+    """Hits, D arrays (R, W, Q) in mm, of paths that are not rays."""
     generator = np.random.default_rng(seed)
     shape = (len(system.forms), system.index.shape[1], rays)
     taper = np.linspace(1.2, 0.3, shape[0])[:, None, None]
@@ -86,7 +86,7 @@ def rough_path(system, rays=3, seed=3):
 
 
 def wide(vector):
-    """(..., 2) of one or two components; one is y."""
+    """(..., 2) from one or two components; a single one is y."""
     x = [np.zeros_like(vector[0])] if len(vector) == 1 else []
     return np.stack([*x, *map(np.asarray, vector)], axis=-1)
 
@@ -101,8 +101,8 @@ def on_surface(surface, form, w):
 
 
 def corners(system, hits):
-    """The hits (R, W, Q, 3) along the axes of the lens, and the object point (3,), by NumPy; at
-    infinity, the object is its direction."""
+    """The hits (R, W, Q, 3) along the axes of the lens, and the object point (3,), with NumPy; for
+    an object at infinity its direction."""
     rows = [jax.tree.map(lambda a, i=i: a[i], system.rows) for i in range(len(system.forms))]
     w = wide(hits)
     points = [on_surface(row, system.forms[i], w[i]) for i, row in enumerate(rows)]

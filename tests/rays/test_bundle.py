@@ -1,4 +1,5 @@
-"""Large bundles: aimed by polynomials, solved in tiles, against the same rays solved plainly."""
+"""Large bundles, aimed by polynomials and solved in tiles, compared with the same rays in small
+bundles."""
 
 import jax
 import jax.numpy as jnp
@@ -39,7 +40,7 @@ def found(lens, points):
 
 
 def parts_of(tree):
-    """Small bundles of arrays with rays last."""
+    """Small bundles from arrays whose last axis is that of rays."""
     return [jax.tree.map(lambda a, i=i: a[..., i : i + PART], tree) for i in range(0, RAYS, PART)]
 
 
@@ -82,7 +83,7 @@ def test_every_ray_obeys_snell_and_crosses_its_stop_point(lens, points, found):
         np.testing.assert_allclose(own[:, :, k], wanted, rtol=0, atol=1e-11)
     crossed = own[:, lens.stop] / float(lens.semi_diameter[lens.stop])
     wanted = np.broadcast_to(np.stack(some)[:, None], crossed.shape)
-    # To rounding of the hits next to it: a stop that bends no light is no point of the path.
+    # Within rounding of the neighbouring hits: a stop that bends no light is not on the path.
     np.testing.assert_allclose(crossed, wanted, rtol=0, atol=1e-13)
 
 
@@ -107,7 +108,7 @@ gradient = jax.jit(jax.grad(weighed, (0, 1, 2)))
 
 @jax.jit
 def tangent(lens, scene, points, found, moving):
-    """Of the hits by the lens, the scene and the points."""
+    """Tangents of the hits by the lens, the scene and the points."""
     return jax.jvp(lambda *at: hits_of(*at, found), (lens, scene, points), moving)[1]
 
 
@@ -120,7 +121,7 @@ def random_like(tree):
 
 @pytest.mark.slow
 def test_derivatives_are_those_of_small_bundles(lens, points, found):
-    """Reverse and forward."""
+    """In reverse and forward mode."""
     at = lens, scene(lens)
     weights = random_like((found.hits[0][0], found.hits[0][0]))
     whole = gradient(*at, points, found, weights)
@@ -144,8 +145,8 @@ def test_derivatives_are_those_of_small_bundles(lens, points, found):
 
 @pytest.mark.slow
 def test_rays_that_fail_are_told_apart(lens, points):
-    """A field at which part of the beam is lost: the same rays as in small bundles, and the same
-    verdicts, but for rays so close to an edge that rounding decides what is said of them."""
+    """At a field at which a part of the beam is lost, the same rays arrive as in small bundles,
+    with the same status, except for rays so close to an edge that rounding decides their status."""
     wide = scene(lens, 0.4)
     whole = search(lens, wide, points)
     parts = [search(lens, wide, p) for p in parts_of(points)]
@@ -164,8 +165,8 @@ def test_rays_that_fail_are_told_apart(lens, points):
 
 @pytest.mark.parametrize("solver", [solve.solve, solve.solve_reverse])
 def test_memory_a_ray_keeps_for_the_backward_pass(lens, solver, monkeypatch):
-    """The hits and whether they are good, 16 bytes a row and 1, and the stop points; the rest does
-    not grow with the bundle."""
+    """For each ray the hits, 16 bytes a row, its status and its stop point; the rest does not grow
+    with the bundle."""
 
     def at_once(system, target):
         zero, rows = jnp.zeros_like(target[0]), len(system.forms)

@@ -41,8 +41,8 @@ STIGMATIC = {
 @pytest.mark.parametrize("gap", [1, 0, -0.1])
 @pytest.mark.parametrize("name", STIGMATIC)
 def test_c18_stigmatic_surfaces(name, gap):
-    """All rays meet in the focus, and their errors do not change with the pupil coordinates; nor
-    with the place of the stop, which may touch or cut the surface."""
+    """All rays meet in the focus, and their errors depend neither on the pupil coordinates nor on
+    the position of the stop, which may touch or cross the surface."""
     surfaces, aperture, far = STIGMATIC[name]
     lens = behind_stop(surfaces, gap * far, aperture)
 
@@ -58,7 +58,8 @@ def test_c18_stigmatic_surfaces(name, gap):
 
 @pytest.mark.slow
 def test_c18_aplanatic_point():
-    """Object in n = 1.5 at R (1 + 1/n): virtual image 25 mm before the vertex, sine ratio 1.5."""
+    """Object in n = 1.5 at R (1 + 1/n): virtual image 25 mm in front of the vertex, sine ratio
+    1.5."""
     tangents = np.tan(np.radians([5.0, 20.0, -20.0]))
     lens = behind_stop(
         [{"radius": -10, "index": 1.0, "thickness": 5.0}], 5.0, 1.0, object={"index": 1.5}
@@ -83,7 +84,7 @@ def test_c18_aplanatic_point():
 
 @pytest.mark.slow
 def test_c19_plane_parallel_plate():
-    """A ray at 30 degrees through 10 mm of n = 1.5 shifts by 3.8762756430420553 mm."""
+    """10 mm of n = 1.5 shift a ray at 30 degrees by 3.8762756430420553 mm."""
     plate = [{"radius": INF, "index": 1.5, "thickness": 10.0}, {"radius": INF, "thickness": 20.0}]
     lens = behind_stop(plate, 10.0, 5.0)
     ray = trace_rays(lens, Scene.point(np.pi / 6, INF, [0.55]), on_y(0.2)).points[0, 0]
@@ -112,7 +113,7 @@ def test_c19_ball_lens_and_thick_lens(front, back, thickness, wanted):
 
 @pytest.mark.slow
 def test_c19_critical_angle():
-    """From n = 1.5 into air a plane reflects totally from 41.810314895778596 degrees on."""
+    """A plane from n = 1.5 into air reflects totally from 41.810314895778596 degrees on."""
     lens = behind_stop(
         [{"radius": INF, "index": 1.0, "thickness": 5.0}], 5.0, 1.0, object={"index": 1.5}
     )
@@ -124,8 +125,8 @@ def test_c19_critical_angle():
 
 @pytest.mark.parametrize("gap", [None, 60.0, 0.0, -3.0])
 def test_p11_defocused_paraboloid(cases, gap):
-    """Variances to 1e-12, and their derivative by the defocus: with the stop on the mirror, or a
-    plane in front of it, through it (the rim lies 2 mm before the vertex) or behind it."""
+    """Variances to 1e-12, and their derivative by the defocus, for a stop on the mirror, or a plane
+    in front of it, through it (the rim lies 2 mm in front of the vertex) or behind it."""
     mirror = {"radius": -100, "conic": -1, "mirror": True}
     if gap is None:
         lens = load_lens(

@@ -1,5 +1,5 @@
-"""Every derivative against an independent trace: `drt_jax` in reverse and in forward mode against
-the complex step through `oracle`, whose own derivatives are proved by 50-digit differences."""
+"""Every derivative compared with an independent trace: `drt_jax` in reverse and in forward mode
+with the complex step through `oracle`, whose derivatives are checked by 50-digit differences."""
 
 import dataclasses
 import functools
@@ -99,7 +99,7 @@ FREEFORM = [
         "decentre": [-0.3, 0.2],
     },
 ]
-# Two mirrors side by side, turned by 30 degrees; the second is curved. The stop is behind them.
+# Two mirrors side by side, tilted by 30 degrees; the second is curved. The stop is behind them.
 FOLDED = [
     {"radius": 120, "conic": -0.5, "thickness": 6, "glass": "N-BK7"},
     {"radius": -300, "thickness": 24},
@@ -126,7 +126,7 @@ FOLDED = [
     },
     {"radius": 150, "coefficients": {4: 1e-6}, "decentre": [-0.2, 17.3]},
 ]
-# Rotational, with a surface inside a glass, which bends nothing.
+# Rotationally symmetric, with a surface inside a glass, which bends no light.
 ROUND = [
     {
         "radius": 45,
@@ -149,7 +149,7 @@ ROUND = [
 ]
 
 
-# Lens, field in radians, distances in mm, part of the pupil that the moments are taken over.
+# Lens, field in radians, distances in mm, part of the pupil for the moments.
 SCENES = {
     "freeform": (
         {
@@ -225,7 +225,7 @@ def parameters(name, distance):
 
 @functools.partial(jax.jit, static_argnums=1)
 def derivatives(arguments, rule, hits):
-    """The derivatives of all outputs in reverse and in forward mode. hits: those of `hits_of`."""
+    """The derivatives of all outputs in reverse and in forward mode. hits: result of `hits_of`."""
 
     def outputs(arguments):
         lens, scene = arguments["lens"], scene_from(arguments)
@@ -238,12 +238,12 @@ def derivatives(arguments, rule, hits):
         last = tuple(hit[..., -len(POINTS) :] for hit in last.hits)
         return spot.mean, spot.covariance, optical_path(last, system)
 
-    tangents = jax.linearize(outputs, arguments)[1]  # each mode of what is linear takes it as it is
+    tangents = jax.linearize(outputs, arguments)[1]  # linear, for both modes
     return jax.jacrev(tangents)(arguments), jax.jacfwd(tangents)(arguments)
 
 
 def found(aims, hits):
-    """Aims, and their rays with derivatives."""
+    """Aims, and the rays with derivatives."""
     system, target = aims
     ok = jnp.full(hits[0].shape[1:], Status.OK, jnp.int32)
     rays = Found(hits, arrival(hits, system), ok, jnp.int32(0))
@@ -251,13 +251,13 @@ def found(aims, hits):
 
 
 def bundles_of(nodes):
-    """The points of a rule and `POINTS`, as one bundle unless the rule is of meridional rays."""
+    """The points of a rule and `POINTS`, as one bundle unless the rule has meridional rays."""
     points = tuple(POINTS.T)
     return [nodes, points] if len(nodes) == 1 else [tuple(map(jnp.append, nodes, points))]
 
 
 def hits_of(lens, scene, nodes):
-    """Hits of the oracle on what bends the rays of `bundles_of`."""
+    """Hits by the oracle on the active surfaces, for the rays of `bundles_of`."""
     for points in bundles_of(nodes):
         plane = np.stack([*[np.zeros_like(points[0])] * (2 - len(points)), *points])
         own = oracle.trace(scene, *oracle.aim(scene, plane)).own
@@ -279,7 +279,7 @@ def of_row(tree, row):
 
 
 def relative_error(ours, reference, rank, floor=1e-4):
-    """As the header of the table says; `rank` is that of the parameter's array."""
+    """Error as defined in the header of the table; `rank` is that of the parameter's array."""
     if reference.size == 0:
         return 0.0
     assert ours.shape == reference.shape and np.all(np.isfinite(ours))
@@ -291,7 +291,7 @@ def relative_error(ours, reference, rank, floor=1e-4):
 
 
 def write_section(title, rows):
-    """Put one scene's table into the file."""
+    """Writes the table of one scene into the file."""
     text = TABLE.read_text() if TABLE.is_file() else ""
     sections = dict(re.findall(r"^## (.*?)\n(.*?)(?=^## |\Z)", text, flags=re.M | re.S))
     lines = [f"| parameter | {' | '.join(OUTPUTS)} |", "|--" * (1 + len(OUTPUTS)) + "|"]
@@ -342,7 +342,7 @@ def test_all_derivatives_agree_with_the_complex_step(name, write_tables):
                     reference, rank = reference[..., 1], 0
                 both = [of_row(tree[i], row) for tree in ours]
                 table[row].append([relative_error(each, reference, rank) for each in both])
-                # Of the largest element: those that are 0 by geometry hold rounding alone.
+                # Relative to the largest element; those that are 0 by geometry are only rounding.
                 assert relative_error(*both, rank, floor=1) <= 1e-10, (row, output)
         if write_tables:
             write_section(title_of(name, distance), table)

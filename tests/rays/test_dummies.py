@@ -1,4 +1,4 @@
-"""Surfaces that bend no light are crossed by the straight ray, and every crossing is checked."""
+"""A straight ray crosses surfaces that bend no light, and every crossing is checked."""
 
 import dataclasses
 
@@ -21,21 +21,21 @@ PLATE = [
 
 
 def before_the_stop(radius, semi_diameter):
-    """A plate behind a stop, and 12 mm before that a dummy sphere."""
+    """A plate behind a stop, and a dummy sphere 12 mm in front of the stop."""
     dummy = {"radius": radius, "thickness": 12, "semi_diameter": semi_diameter}
     return load_lens({"surfaces": [dummy, STOP, *PLATE]})
 
 
 def crossing(radius, points, directions):
-    """Where lines (Q, 3), (Q, 3) cross the half of the sphere about (0, 0, `radius`) that holds
-    the origin, from the side where its vertex plane lies in front; and whether they do."""
+    """Where lines (Q, 3), (Q, 3) cross the half of the sphere about (0, 0, `radius`) that contains
+    the origin, from the side on which its vertex plane lies in front; and whether they do."""
     offset = points - [0, 0, radius]
     along = np.sum(offset * directions, axis=1)
     square = along**2 - np.sum(offset**2, axis=1) + radius**2
     root = np.sqrt(np.maximum(square, 0))
     s = -along - np.sign(radius) * np.sign(directions[:, 2]) * root
     hit = points + s[:, None] * directions
-    # The package draws a sphere to where its normal leans by acos(0.01).
+    # The package ends a sphere where its normal is tilted by acos(0.01).
     return hit, (square > 0) & (1 - hit[:, 2] / radius > 0.01)
 
 
@@ -43,8 +43,8 @@ def crossing(radius, points, directions):
 @pytest.mark.parametrize("field", [0.0, 0.3, 0.6, 0.8])
 @pytest.mark.parametrize("radius, semi_diameter", [(10.0, 9.9), (10.0, 8.5), (-10.0, 9.9)])
 def test_steep_dummy_before_the_stop(radius, semi_diameter, field):
-    """The truth is where a line meets a sphere: OK inside the aperture, CLIPPED outside, MISSED
-    beside the sphere; points on the ray to 1e-10 mm."""
+    """The reference is the intersection of a line with a sphere: OK inside the aperture, CLIPPED
+    outside, MISSED if the line misses the sphere; points on the ray to 1e-10 mm."""
     lens = before_the_stop(radius, semi_diameter)
     rays = trace_rays(lens, Scene.point(field, np.inf, WAVELENGTHS), POINTS)
     stop = np.concatenate([4 * POINTS, np.full((len(POINTS), 1), 12.0)], axis=1)
@@ -60,19 +60,19 @@ def test_steep_dummy_before_the_stop(radius, semi_diameter, field):
 
 @pytest.mark.slow
 def test_the_rays_behind_do_not_know_of_a_dummy():
-    """Without the dummy: the same points, path and directions to 1e-12."""
+    """Points, path and directions agree with those without the dummy to 1e-12."""
     with_it = trace_rays(before_the_stop(10.0, 9.9), Scene.point(0.6, np.inf, WAVELENGTHS), POINTS)
     lens = load_lens({"surfaces": [STOP, *PLATE]})
     without = trace_rays(lens, Scene.point(0.6, np.inf, WAVELENGTHS), POINTS)
     points = np.asarray(without.points) + np.array([0, 0, 12.0])
     np.testing.assert_allclose(with_it.points[:, :, 1:], points, rtol=0, atol=1e-12)
     np.testing.assert_allclose(with_it.directions[:, :, 1:], without.directions, atol=1e-12)
-    # The path is counted from the plane wave through the first vertex.
+    # The path is measured from the plane wave through the first vertex.
     path = with_it.path - 12 * np.cos(0.6)
     np.testing.assert_allclose(path, without.path, rtol=0, atol=1e-12)
 
 
-# Behind, inside and in front of what bends light; aspheric, tilted and decentred; poked through.
+# Behind, between and in front of active surfaces; aspheric, tilted, decentred; crossed by others.
 SCATTERED = [
     {"radius": 9, "conic": -0.4, "thickness": 1, "semi_diameter": 7, "decentre": [0.4, -0.3]},
     {"radius": 40, "thickness": 1, "glass": "N-BK7"},
@@ -89,7 +89,7 @@ SCATTERED = [
 @pytest.mark.slow
 @pytest.mark.parametrize("field", [[0.0, 0.0], [0.1, 0.3], [-0.2, -0.45]])
 def test_scattered_dummies_and_a_curved_stop(field):
-    """Every crossing as the oracle has it, to 1e-10 mm; and what misses one is MISSED."""
+    """Every crossing agrees with the oracle to 1e-10 mm; a ray that misses one is MISSED."""
     lens = load_lens({"surfaces": SCATTERED})
     scene = oracle.Scene.of(lens, field, 200.0, WAVELENGTHS)
     rays = trace_rays(lens, Scene.point(field, 200.0, WAVELENGTHS), POINTS)
@@ -116,7 +116,7 @@ def by_the_lens(lens):
 
 @pytest.mark.slow
 def test_sensor_and_plane_stop_do_not_bend():
-    """They have no derivatives by curvature, conic and coefficients, unless asked for by name."""
+    """They have no derivatives by curvature, conic and coefficients, unless they are named."""
     lens = load_lens({"surfaces": [STOP, PLATE[0], PLATE[1] | {"coefficients": {4: 1e-6}}]})
     gradient = by_the_lens(lens)
     assert not any(np.any(getattr(gradient, name)[np.array([0, 3])]) for name in SHAPE)
@@ -129,7 +129,7 @@ def test_sensor_and_plane_stop_do_not_bend():
 
 @pytest.mark.slow
 def test_what_a_file_bends_may_be_bent():
-    """A curved stop that bends no light has its derivatives."""
+    """A curved stop that bends no light has these derivatives."""
     lens = load_lens({"surfaces": [STOP | {"radius": 40.0}, *PLATE]})
     assert lens.curved == (0,)
     gradient = by_the_lens(lens)

@@ -1,4 +1,5 @@
-"""Elements that move together, and turns of the axis: against what moving them must do."""
+"""Elements that move together, and rotations of the axis, compared with moves that have a known
+effect."""
 
 import dataclasses
 
@@ -11,7 +12,7 @@ from drt_jax import Gauss, Scene, focus_moments, load_lens, psf_moments, trace_r
 
 INF = float("inf")
 PUPIL = np.array([[0, 0], [0.5, 0], [-0.3, 0.8], [0.1, -0.9]])
-# A pivot or a place that no symmetry hides.
+# A pivot or a position without symmetry.
 MOVE = {"tilt": [0.4, -0.3, 0.2], "shift": [0.05, -0.02, 0.03], "pivot": 1.7}
 SURFACES = [
     {"radius": 61.5, "thickness": 6.0, "glass": "N-BK7", "semi_diameter": 8.0, "stop": True},
@@ -27,7 +28,7 @@ def lens_with(*elements, surfaces=SURFACES):
 
 
 def rotation(degrees):
-    """About x, then the turned y, then the turned z."""
+    """Rotation about x, then the rotated y, then the rotated z."""
     (cx, cy, cz), (sx, sy, sz) = (f(np.radians(degrees)) for f in (np.cos, np.sin))
     about_x = np.array([[1, 0, 0], [0, cx, -sx], [0, sx, cx]])
     about_y = np.array([[cy, 0, sy], [0, 1, 0], [-sy, 0, cy]])
@@ -86,8 +87,8 @@ def test_a_sphere_turns_about_its_centre_without_effect():
 
 @pytest.mark.slow
 def test_a_folding_mirror_changes_no_image():
-    """A mirror at 45 degrees turns the axis of all that follows by 90 degrees; the light then goes
-    against it."""
+    """A mirror at 45 degrees rotates the axis of all that follows by 90 degrees; light then runs
+    against the axis."""
     rows = [dict(row) for row in SURFACES]
     rows[4]["thickness"] = 15.0
     rows.append({"radius": INF, "mirror": True, "thickness": -20.0, "tilt": [45.0, 0, 0]})
@@ -108,8 +109,9 @@ def test_a_folding_mirror_changes_no_image():
 
 
 def spectrometer(order):
-    """A Czerny-Turner spectrometer, three coordinate breaks and their undoing, as N. Hagen's lens
-    files hold it (czt_spect.zmx): decentres and tilts that its program solved for the chief ray."""
+    """A Czerny-Turner spectrometer with three coordinate breaks and their inverses, as in N.
+    Hagen's lens file czt_spect.zmx, with decentres and tilts that its program solved for the chief
+    ray."""
     offset, arm = 60.0, 166.3611490362
     grating = {"form": "linear", "order": order, "coefficients": {"y": 600.0}}
     mirror = {"radius": -400.0, "mirror": True}
@@ -139,7 +141,7 @@ def test_coordinate_breaks_lie_where_another_program_puts_them():
 
 @pytest.mark.slow
 def test_the_chief_ray_of_a_grating_spectrometer_goes_where_another_program_found_it():
-    """It solved the decentres for the chief ray at 550 nm to 13 digits."""
+    """The program solved the decentres for the chief ray at 550 nm to 13 digits."""
     rays = trace_rays(
         spectrometer(-1), Scene.point(0.0, 181.3611490362, (0.45, 0.55, 0.65)), [[0.0, 0.0]]
     )
@@ -153,8 +155,8 @@ def test_the_chief_ray_of_a_grating_spectrometer_goes_where_another_program_foun
     assert abs(sensor[0] - sensor[2]) > 20  # mm between 450 and 650 nm
 
 
-# How elements may hold the sensor: alone, as the tilt of it; about another surface and a pivot;
-# with a surface, tilted itself; about itself, within an element about something else.
+# Elements that contain the sensor: the sensor alone, as a tilt; about another surface and a pivot;
+# with a surface, and tilted itself; about itself, inside an element about another surface.
 HELD = {
     "alone": [{"surfaces": ["sensor", "sensor"], "tilt": [10.0, 0, 0]}],
     "about a surface": [
@@ -170,7 +172,8 @@ HELD = {
 @pytest.mark.slow
 @pytest.mark.parametrize("name", HELD)
 def test_a_held_sensor_moves_as_its_elements_turn_it(name):
-    """The polynomials in the sensor position, beside the lens with its sensor really moved."""
+    """The polynomials in the sensor position, compared with the lens whose sensor is really
+    moved."""
     lens = lens_with(*HELD[name])
     if name == "with a surface":
         lens = dataclasses.replace(
@@ -205,7 +208,7 @@ def test_a_sensor_turned_by_an_element_is_one_that_is_tilted():
 
 
 def test_elements_that_move_with_the_sensor_have_no_polynomials():
-    """Surfaces turned about the sensor move where it moves."""
+    """Surfaces that are rotated about the sensor move with it."""
     turned = lens_with({"surfaces": [3, 4], "about": "sensor", "tilt": [1.0, 0, 0]})
     with pytest.raises(ValueError, match=r"elements\[0\]: .* about the sensor"):
         focus_moments(turned, Scene.point(0.0, INF, 0.55), sampling=Gauss(2, "none"))
@@ -213,7 +216,7 @@ def test_elements_that_move_with_the_sensor_have_no_polynomials():
 
 @pytest.mark.slow
 def test_derivatives_by_every_move():
-    """Of the centroid and covariance, against differences; about a centred lens too."""
+    """Of centroid and covariance, compared with differences; also about a centred lens."""
     for move in (MOVE, {}):
         lens = lens_with({"surfaces": [2, "sensor"]}, {"surfaces": [3, 4]} | move)
 

@@ -1,4 +1,5 @@
-"""The Fermat system against automatic differentiation and geometry, `linear` against dense solves.
+"""The Fermat system compared with automatic differentiation and geometry, `linear` with dense
+solves.
 
 For a stop that bends no light and one that does, tilted systems, one component and two.
 """
@@ -45,9 +46,9 @@ def equations(hits, system):
 
 
 class Answers(NamedTuple):
-    """path, gradient: of a bundle. equations: F and the label. columns: their Jacobian, a leading
-    axis (R D), the derivatives by one component of one hit, of all rays at once. solved, pulled:
-    what `linear` makes of forces and a shift, and its transpose of `other`."""
+    """path, gradient: of a bundle. equations: F and the label. columns: their Jacobian, with a
+    leading axis (R D), the derivatives by one component of one hit, for all rays together. solved,
+    pulled: result of `linear` for forces and a shift, and its transpose applied to `other`."""
 
     path: jax.Array
     gradient: tuple
@@ -59,7 +60,7 @@ class Answers(NamedTuple):
 
 @jax.jit
 def answers(system, hits, good, forces, shift, other):
-    """Everything at once: one program for a kind of system."""
+    """All results together, in one program for each kind of system."""
     gradient = jax.grad(lambda w: jnp.sum(fermat.optical_path(w, system)))(hits)
     rows, dim = len(system.forms), len(hits)
     units = jnp.eye(rows * dim).reshape(-1, dim, rows, 1, 1)
@@ -95,7 +96,7 @@ def flat(vector, rest=()):
 
 @pytest.fixture(scope="module", params=CASES)
 def case(request):
-    """A system, a path through it that is no ray, and what is differentiated there."""
+    """A system, a path through it that is not a ray, and the differentiated arguments."""
     stop, dim, tilted = CASES[request.param]
     system = system_with(stop, dim, tilted)
     hits = rough_path(system, RAYS)
@@ -104,14 +105,14 @@ def case(request):
 
 @jax.jit
 def less_the_first(hits, system):
-    """Paths less that of the first ray."""
+    """Paths minus that of the first ray."""
     return fermat.optical_path(hits, system, tuple(h[..., :1] for h in hits))
 
 
 @pytest.mark.parametrize("case", ["meridional", "tilted, active stop"], indirect=True)
 def test_float32_holds_the_differences_of_long_paths(case):
-    """Paths of 10 m, less the first of them, against float64; summed and then subtracted they are
-    wrong by 1e-3 mm."""
+    """Paths of 10 m, minus the first of them, compared with float64; if they are summed before they
+    are subtracted, the error is 1e-3 mm."""
     system, hits, _ = case
     vertex = system.rows.vertex.at[1:].add(1e4)
     rows = system.rows._replace(vertex=vertex)
@@ -127,15 +128,15 @@ def test_float32_holds_the_differences_of_long_paths(case):
 
 
 def test_residual_is_the_gradient_of_the_path(case):
-    """But for the component that belongs to the sensor: nothing is stationary there."""
+    """Except for the components of the sensor, on which paths are not stationary."""
     _, _, all_of = case
     for ours, wanted in zip(all_of.equations[0], all_of.gradient, strict=True):
         np.testing.assert_allclose(ours, wanted[:-1], rtol=0, atol=4e-15)
 
 
 def test_path_and_label_against_geometry(case):
-    """Lengths summed up in NumPy, from the sphere round the object through the first vertex of the
-    lens; and a point of the stop on the line through the hits that enclose it."""
+    """Lengths are summed in NumPy, from the sphere about the object through the first vertex of the
+    lens; the label is a point of the stop on the line through the hits on both sides."""
     system, hits, all_of = case
     path, (_, label) = all_of.path, all_of.equations
     points, source = corners(system, hits)
@@ -178,8 +179,9 @@ def flat_columns(columns):
 
 
 def test_nothing_is_asked_of_the_distance_to_the_stop():
-    """The stop on a surface, before and behind it: the same path, one and the same solution up to
-    what the stop moves; a path drawn through one point stays finite where its rays are left out."""
+    """With the stop on a surface, in front of and behind it, the path and the solution are the same
+    except for the motion of the stop. A path whose hits are all at one point stays finite if its
+    rays are left out."""
     system = system_with("in front", 2, True)
     hits = rough_path(system, RAYS)
     moves = []
@@ -194,7 +196,8 @@ def test_nothing_is_asked_of_the_distance_to_the_stop():
 
 
 def test_rays_of_no_interest_come_out_finite():
-    """All hits at one point in planes without distance: no length, no direction."""
+    """All hits at one point, in planes without distance: the segments have no length and no
+    direction."""
     system = system_with("between", 2)
     rows, stop = (jax.tree.map(jnp.zeros_like, a) for a in (system.rows, system.stop))
     system = dataclasses.replace(system, rows=rows, stop=stop)

@@ -20,7 +20,7 @@ from .systems import COLOURS
 
 @jax.jit
 def aimed(lens, scene, points, off):
-    """What aiming finds that starts `off` mm from the paraxial launch."""
+    """Result of aiming that starts `off` mm from the paraxial launch."""
     system, target = aims(lens, scene, points)
     sizes = aim.beam_size(system, target)
     launch = aim.paraxial_launch(system, target, sizes[1])
@@ -33,14 +33,15 @@ ZERO = tuple(jnp.zeros((len(COLOURS), 5)) for _ in range(2))
 
 @pytest.mark.slow
 def test_aiming_from_crude_starts():
-    """The same launch from 3 mm around; what cannot be reached says so, and spoils no other."""
+    """The same launch from starts 3 mm around; stop points that cannot be reached are reported, and
+    change no other ray."""
     lens, scene, points, _ = problem("tilted")
     exact = aimed(lens, scene, points, ZERO)
     assert np.all(exact.status == Status.OK) and int(exact.steps) <= 6
     off = tuple(3 * a for a in random_like(ZERO))
     crude = aimed(lens, scene, points, off)
     assert np.all(crude.status == Status.OK) and int(crude.steps) <= 12
-    # A step of Newton's method from a millionth of the beam leaves some 1e-12 of it.
+    # A Newton step from a millionth of the beam radius leaves an error of some 1e-12 of it.
     assert_close(crude.launch, exact.launch, 1e-10)
     far = tuple(p.at[3].set(30.0) for p in points)
     status = np.asarray(aimed(lens, scene, far, ZERO).status)
@@ -49,7 +50,7 @@ def test_aiming_from_crude_starts():
 
 @jax.jit
 def polished(lens, scene, points, hits, active):
-    """What `BlockNewton` makes of hits."""
+    """Result of `BlockNewton` for hits."""
     system, target = aims(lens, scene, points)
 
     def function(hits, args):
@@ -67,8 +68,8 @@ def polished(lens, scene, points, hits, active):
 
 @pytest.mark.slow
 def test_newton_from_the_crudest_start():
-    """Every hit at the stop point: all rays within 8 steps. Those that are not to move stay; one
-    that has no solution tells, stays finite and leaves the others alone."""
+    """With every hit at the stop point, all rays are found within 8 steps. Inactive rays do not
+    move; a ray without a solution is reported, stays finite and does not change others."""
     lens, scene, points, found = problem("tilted")
     start = tuple(
         jnp.broadcast_to(c, h.shape) for c, h in zip(crossings(lens, scene, points), found.hits)
@@ -92,7 +93,8 @@ def test_newton_from_the_crudest_start():
 
 @pytest.mark.slow
 def test_hits_that_rounding_would_turn_are_not_accepted():
-    """Two equal surfaces a nanometre of a nanometre apart: rays exist, their directions drown."""
+    """Two equal surfaces at a distance of 1e-9 mm: rays exist, but rounding changes their
+    directions."""
     lens, scene, points, _ = problem("meridional")
     same = {k: getattr(lens, k).at[1].set(getattr(lens, k)[0]) for k in ("curvature", "conic")}
     same["coefficients"] = lens.coefficients.at[1].set(lens.coefficients[0])
@@ -106,7 +108,8 @@ def test_hits_that_rounding_would_turn_are_not_accepted():
 
 @pytest.mark.slow
 def test_a_polish_that_takes_one_step_shorter_than_rounding_of_a_mm():
-    """All surfaces within 0.2 um, in the stop's middle: hits of 1e-5 mm, of which 7e-17 is much."""
+    """All surfaces within 0.2 um, at the centre of the stop: hits of 1e-5 mm, for which 7e-17 is
+    large."""
     bent = [{"radius": -61.193, "index": n, "thickness": t} for n, t in ((1.93, 1e-4), (1.9, 1e-6))]
     bent.append({"radius": -61.193, "thickness": 1e-4, "semi_diameter": 12.5, "stop": True})
     bent += [{"radius": "inf", "index": 1.92, "thickness": 1e-6}, {"radius": "inf"}]
@@ -121,7 +124,7 @@ def test_a_polish_that_takes_one_step_shorter_than_rounding_of_a_mm():
 
 
 def hostile(seed):
-    """A lens with the structure of the "tilted" one, and a scene, to break the search."""
+    """A lens with the structure of the "tilted" one, and a difficult scene."""
     generator = np.random.default_rng(seed)
     lens, scene, *_ = problem("tilted")
     bent = lens.curvature * generator.uniform(-4, 6, lens.curvature.shape)
@@ -133,8 +136,8 @@ def hostile(seed):
 
 @pytest.mark.slow
 def test_hostile_lenses():
-    """Nothing is ever not finite; what is found crosses the stop at its point; and the fan finds
-    rays that the first aim does not, beside those that it does."""
+    """All numbers are finite; rays that are found cross the stop at their points; and the fan finds
+    rays that the first aim does not, in addition to those that it finds."""
     _, _, points, found = problem("tilted")
     weights = random_like(found.hits)
     saved = mixed = lost = 0
@@ -156,7 +159,8 @@ def test_hostile_lenses():
 
 @pytest.mark.slow
 def test_the_fan_under_vmap():
-    """Scenes that need it and scenes that do not, side by side: each as alone."""
+    """Scenes that need the fan together with others that do not: each has the same result as
+    alone."""
     _, _, points, _ = problem("tilted")
     scenes = [hostile(seed) for seed in range(8)]
     alone = [search(*scene, points) for scene in scenes]
@@ -170,7 +174,8 @@ def test_the_fan_under_vmap():
 
 @pytest.mark.slow
 def test_several_rays_that_are_sought():
-    """Two of a bundle that the first aim does not find: each from its own nearest starts."""
+    """Two rays of a bundle that the first aim does not find: each starts from its own nearest
+    rays."""
     radius, gap = (-21.77, -9.051, 14.174, 9.3, "inf"), (2.219, 1.995, 6.392, 6.941, 22.718)
     index = (1.804, 1, 1.402, 1, 1)
     names = "radius", "thickness", "index"
@@ -183,8 +188,8 @@ def test_several_rays_that_are_sought():
 
 @pytest.mark.slow
 def test_where_neighbouring_surfaces_cross_a_ray_is_told_so():
-    """A thin plano-convex lens: the sphere, R = 20, lies behind the plane 2 mm away from
-    y^2 = 20^2 - 18^2 on. Snell's law carries a ray back to the plane and through a stop behind."""
+    """A thin plano-convex lens: the sphere, R = 20, lies behind the plane, 2 mm away, from y^2 =
+    20^2 - 18^2 on. Snell's law would take a ray back to the plane and through a stop behind."""
     surfaces = [
         {"radius": 20.0, "index": 1.5, "thickness": 6.0},
         {"radius": "inf", "thickness": 4.0},

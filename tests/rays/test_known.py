@@ -17,13 +17,13 @@ from drt_jax.rays.trace import trace_bundle
 
 from ..conftest import assert_close
 
-# Rays in several tiles, in no order of the field.
+# Rays in several tiles, without any order.
 POINTS = drt_jax.pupil.random_disc(300, 0)[0].T
 
 
 @pytest.fixture(scope="module")
 def dimmed():
-    """The Double Gauss with rims that clip the beam of an oblique field."""
+    """The Double Gauss with rims that vignette the beam of an oblique field."""
     lens = load_lens("double_gauss")
     edges = (0.8 * lens.semi_diameter).at[lens.stop].set(9.0)
     return dataclasses.replace(lens, semi_diameter=edges)
@@ -31,8 +31,8 @@ def dimmed():
 
 @pytest.mark.slow
 def test_known_rays_are_those_of_a_search():
-    """In tiles, also of points that are not finite, and where rays fail: through a stop that is
-    far too wide."""
+    """In tiles; also for points that are not finite, and if rays fail, with a stop that is much too
+    wide."""
     lens = load_lens("singlet")
     wide = lens.semi_diameter.at[lens.stop].multiply(6.0)
     lens = dataclasses.replace(lens, semi_diameter=wide)
@@ -67,7 +67,7 @@ def test_nothing_is_known_inside_of_jit():
 
 @pytest.mark.slow
 def test_analyses_share_the_programs_that_find_rays(dimmed):
-    """Whatever the analysis, its rule, and the number of object points."""
+    """For any analysis, rule, and number of object points."""
     two = Scene.degrees([0, 14], wavelengths=(0.6, 0.48))
     drt_jax.spot_diagram(dimmed, two)
     rule_rays(dimmed, checked_scene(dimmed, two), drt_jax.Clipped(5, "bilateral"))

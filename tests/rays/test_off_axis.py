@@ -1,16 +1,5 @@
-"""Off-axis conic mirrors, used from one focus to the other, against the definition of a conic.
-
-Light starts at the focus F1, 50 mm in front of the stop, and the chief ray meets the mirror 100 mm
-from F1, where it turns by `turn`. The other focus F2 lies `q` mm behind along the chief ray (an
-ellipsoid), as much in front (a hyperboloid, q < 0), or at infinity (a paraboloid). A point P of the
-mirror has
-|P - F1| + sign(q) |P - F2| = 100 + q, so that a ray along d meets it at the distance
-
-    t = (S^2 - D^2) / (2 (S - d.D)),    S = 100 + q, D = F2 - F1.
-
-Each mirror is prescribed with its axis from the vertex into the beam, and the other way round. All
-have one structure, so that one program traces them.
-"""
+"""Off-axis conic mirrors, used from one focus to the other, compared with the definition of a
+conic."""
 
 import dataclasses
 
@@ -27,18 +16,18 @@ Z = np.array([0.0, 0.0, 1.0])
 
 
 def turned(degrees):
-    """The direction of the chief ray behind the mirror."""
+    """Direction of the chief ray behind the mirror."""
     return np.array([0.0, np.sin(np.radians(degrees)), np.cos(np.radians(degrees))])
 
 
 def tilt(axis):
-    """The tilt that turns z to an axis in the y, z plane, degrees."""
+    """Tilt that rotates z to an axis in the y, z plane, degrees."""
     return [float(np.degrees(np.arctan2(-axis[1], axis[2]))), 0.0, 0.0]
 
 
 def mirror(vertex, opening, radius, conic, sensor, leaving, semi, flipped):
-    """A stop at z = 0, a conic mirror and a sensor across the chief ray. opening: unit vector from
-    the vertex into the conic."""
+    """A stop at z = 0, a conic mirror, and a sensor perpendicular to the chief ray. opening: unit
+    vector from the vertex into the conic."""
     axis, radius = (-opening, -radius) if flipped else (opening, radius)
     rows = [
         {"radius": "inf", "semi_diameter": semi, "stop": True, "thickness": float(vertex[2])},
@@ -55,8 +44,8 @@ def mirror(vertex, opening, radius, conic, sensor, leaving, semi, flipped):
 
 
 def from_focus(turn, q, semi, flipped=False):
-    """The lens, and of its rays the right hits on the mirror (Q, 3), directions behind it and paths
-    to the sensor, 250 mm behind the mirror."""
+    """The lens; and the exact hits of its rays on the mirror (Q, 3), directions behind it and paths
+    to the sensor, which is 250 mm behind the mirror."""
     leaving, hit = turned(turn), SOURCE + FAR * Z
     d = np.concatenate([semi * PUPIL, np.full((len(PUPIL), 1), 50.0)], axis=1)
     d /= np.linalg.norm(d, axis=1, keepdims=True)
@@ -122,7 +111,7 @@ def test_a_beam_to_the_focus(turn, flipped):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["paraboloid 90", "ellipsoid 150"])
 def test_derivatives_of_hits_by_the_tilt_of_the_mirror(name):
-    """Against central differences of traced rays, in both modes."""
+    """Compared with central differences of traced rays, in both modes."""
     lens, *_ = from_focus(*CASES[name], True)
 
     def hits(angle):

@@ -1,4 +1,4 @@
-"""The oracle's own derivatives against differences with 50 digits."""
+"""The oracle's derivatives compared with differences of 50 digits."""
 
 import mpmath
 import numpy as np
@@ -24,8 +24,8 @@ def exact_place(scene, i, z0):
 
 
 def exact_trace(scene, x, y):
-    """One ray of the first colour in mpmath: stop point, path, sensor point. `scene` holds
-    nested lists of mpf; only the sags are shared, with the tests of `surface`."""
+    """One ray of the first wavelength in mpmath: stop point, path, sensor point. `scene` has nested
+    lists of mpf; it shares only the sags, with the tests of `surface`."""
     mpf, small = mpmath.mpf, mpmath.mpf(10) ** -17
     tangent = [mpmath.tan(a) for a in scene["field"]]
     source = mpmath.matrix([-t * scene["distance"] for t in tangent] + [-scene["distance"]])
@@ -69,7 +69,8 @@ def exact_trace(scene, x, y):
 
 
 def exact_indices(scene):
-    """Of the first colour; behind a surface off the path, that in front of it."""
+    """Indices at the first wavelength; behind a surface that is off the path, the index in front of
+    it."""
     square = mpmath.mpf(WAVELENGTHS[0]) ** 2
     n = []
     for i, (bs, cs, s) in enumerate(zip(scene["strength"], scene["resonance"], scene["schott"])):
@@ -85,7 +86,7 @@ def exact_indices(scene):
 @pytest.mark.slow
 @pytest.mark.parametrize("name, rays", [("freeform", 2), ("folded", 1)])
 def test_oracle_against_50_digits(name, rays):
-    """Along a random direction in each array: paths and sensor points, 1e-12."""
+    """Along a random direction in each array: paths and sensor points to 1e-12."""
     arguments, rows = parameters(name, SCENES[name][2][0])
     _, field, (distance,), _ = SCENES[name]
     scene = oracle.Scene.of(arguments["lens"], field, distance, WAVELENGTHS[:1])
@@ -93,7 +94,7 @@ def test_oracle_against_50_digits(name, rays):
     start = oracle._aimed(scene, points)
     for row in rows:
         value = scene.values[row]
-        # A high power that is 0 would be moved far beyond where differences are small.
+        # The step of a high power that is 0 would be too large for accurate differences.
         still = 0 if row == "coefficients" else 1e-3
         step = generator.uniform(0.5, 1, value.shape) * np.where(value == 0, still, np.abs(value))
         step = np.where(np.isinf(value), 0, step)

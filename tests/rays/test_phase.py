@@ -1,4 +1,4 @@
-"""Surfaces that add phase: gratings, zone plates and hybrids, against their closed forms."""
+"""Surfaces that add a phase: gratings, zone plates and hybrids, compared with closed forms."""
 
 import dataclasses
 
@@ -41,7 +41,7 @@ def zone_plate(f, wavelength, terms, **where):
 @pytest.mark.parametrize("order", [-2, 0, 1])
 @pytest.mark.parametrize("mirror", [False, True])
 def test_the_grating_equation_in_and_out_of_plane(order, mirror):
-    """Along the grating: n' d' - n d = m L (0, T), whatever the light's direction."""
+    """Along the grating n' d' - n d = m L (0, T), for any direction of the light."""
     lines = 400.0
     phase = {"form": "linear", "order": order, "coefficients": {"y": lines}}
     behind = {"mirror": True, "thickness": -10.0} if mirror else {"index": 1.6, "thickness": 10.0}
@@ -98,8 +98,8 @@ def test_a_mirror_of_phase_focuses_like_a_paraboloid():
 
 
 def test_a_hybrid_achromat():
-    """A thin lens of N-BK7 and a zone plate: powers as Abbe's numbers 64 and -3.45 ask for bring F
-    and C together, and d to where the partial dispersions say."""
+    """A thin lens of N-BK7 and a zone plate: powers for Abbe numbers 64 and -3.45 make the foci of
+    F and C equal; that of d follows from the partial dispersions."""
     f = 100.0
     dF, dd, dC = COLOURS
     n = np.asarray(load_lens({"surfaces": [STOP | {"glass": "N-BK7"}]}).index(COLOURS))[1]
@@ -123,7 +123,7 @@ FORMS = {
     "linear": {"y": 40.0},
     "polynomial_xy": {"x1y0": 9.0, "x0y1": -20.0, "x2y0": -25.0, "x1y1": 2.0, "x0y3": 0.2},
 }
-# Surfaces on which the phase lies, and where the stop is.
+# Surfaces that have the phase, and positions of the stop.
 BASES = {
     "plane": {"radius": INF},
     "asphere": {"radius": 40.0, "conic": -0.5, "coefficients": {4: 1e-5}, "glass": "N-BK7"},
@@ -156,8 +156,8 @@ def hybrid(form, base, stop):
     ],
 )
 def test_rays_are_stationary_and_their_derivatives_right(form, base, stop):
-    """Fermat: a hit that moves changes the path by nothing. And the derivatives of hits and paths
-    by phase, order, wavelength and shapes against differences."""
+    """By Fermat's principle, a small move of a hit does not change the path. The derivatives of
+    hits and paths by phase, order, wavelength and shapes agree with differences."""
     lens = bendable(hybrid(form, base, stop))
     at = {"field": jnp.array([0.03, 0.08]), "colours": jnp.asarray(COLOURS[:2])}
 

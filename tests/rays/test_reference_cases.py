@@ -1,8 +1,8 @@
-"""Prescriptions and printed numbers of other programs through the Fermat tracer.
+"""Prescriptions and printed numbers of other programs, with the Fermat tracer.
 
 The cases are those of reference_cases.yaml and psf_cases.yaml, named by their id. Where a listing
-labels rays by their height in front of the lens, a stop plane in the same medium does so here, be
-it before the first surface, at its vertex or behind it.
+labels rays by their height in front of the lens, a stop plane in the same medium does so here; it
+may lie in front of the first surface, at its vertex or behind it.
 """
 
 import dataclasses
@@ -25,7 +25,8 @@ INF = np.inf
 
 
 def focus(points, vertex):
-    """Where rays (Q, S + 1, 3) cross the axis behind their last surface, mm from `vertex`."""
+    """Intersections of rays (Q, S + 1, 3) with the axis behind their last surface, mm from
+    `vertex`."""
     (y0, z0), (y1, z1) = points[:, -2, 1:].T, points[:, -1, 1:].T
     return z0 - y0 * (z1 - z0) / (y1 - y0) - vertex
 
@@ -34,7 +35,7 @@ def focus(points, vertex):
 
 
 def double_gauss(cases):
-    """Surfaces of C01 as a prescription has them, by glass."""
+    """Surfaces of C01 as in a prescription, by glass."""
     entry = cases["C01"]["prescription"]
     surfaces = [
         {"curvature": row["c"], "thickness": row["t"], "glass": glass}
@@ -53,9 +54,9 @@ def double_gauss_lens(cases):
 
 @pytest.mark.parametrize("gap", [10.0, 0.0, -3.0])
 def test_c01_marginal_ray(cases, gap):
-    """x, z, slope and distance at each surface: half a unit of the sixth decimal; angles of
-    incidence: of the second, in degrees. The rim of the first surface lies 5.9 mm behind its
-    vertex, so that it pokes through a stop that is nearer."""
+    """x, z, slope and distance at each surface to half a unit of the sixth decimal; angles of
+    incidence to that of the second, in degrees. The rim of the first surface lies 5.9 mm behind its
+    vertex, so that it crosses a stop that is closer."""
     lens = behind_stop(double_gauss(cases), gap, 25.0)
     rays = trace_rays(lens, Scene.point(0.0, INF, [0.5876]), on_y(1.0, 0.8, 0.6, 0.4))
     points = np.asarray(rays.points[0, 0, 1:])
@@ -92,7 +93,7 @@ def test_c01_ray_errors_and_path_differences(cases):
 
 
 def test_c02_first_order_data(cases):
-    """Lengths and f-number to half a unit of the fourth decimal, indices of the sixth."""
+    """Lengths and f-number to half a unit of the fourth decimal, indices to that of the sixth."""
     reference = cases["C02"]["reference"]
     lens, d = double_gauss_lens(cases), jnp.array([0.5876])
     first = drt_jax.first_order(lens, INF, d)
@@ -119,8 +120,8 @@ def test_c02_first_order_data(cases):
 
 @pytest.mark.slow
 def test_c02_paraxial_rays(cases):
-    """Heights and slopes at each surface: half a unit of the sixth decimal; and the Fermat
-    rays at a ten thousandth of the aperture have the heights of the paraxial marginal ray."""
+    """Heights and slopes at each surface to half a unit of the sixth decimal; Fermat rays at a ten
+    thousandth of the aperture have the heights of the paraxial marginal ray."""
     reference = cases["C02"]["reference"]
     lens, d = double_gauss_lens(cases), jnp.array([0.5876])
     tangent = np.tan(np.radians(14))
@@ -142,7 +143,7 @@ def test_c02_paraxial_rays(cases):
 
 
 def test_c02_third_order_sums(cases):
-    """Transverse, in mm: half a unit of the sixth decimal."""
+    """Transverse, in mm, to half a unit of the sixth decimal."""
     lens = double_gauss_lens(cases)
     colours = jnp.array([0.6563, 0.5876, 0.4861])
     total = drt_jax.third_order(lens, Scene.point(np.radians(14), INF, colours)).total
@@ -174,7 +175,7 @@ def lsst(cases):
 
 @pytest.mark.parametrize("name", ["LSST_trace_0", "LSST_trace_1", "LSST_trace_2"])
 def test_c08_rays(cases, lsst, name):
-    """Positions to 1e-6 mm, of which 1e-7 mm are printed, cosines to 3e-10."""
+    """Positions to 1e-6 mm, which are printed to 1e-7 mm, cosines to 3e-10."""
     rows = np.array(cases["C08"]["reference"]["rays"][name])[:, 1:]
     start, cosines = rows[0, :3], rows[:, 3:]
     field = np.arctan(cosines[0, :2] / cosines[0, 2])
@@ -189,7 +190,7 @@ def test_c08_rays(cases, lsst, name):
 @pytest.mark.slow
 def test_c08_whole_pupil(cases, lsst):
     """The plane of the entrance pupil touches the rim of the first mirror, within 1e-5 mm: every
-    ray of the stop as the oracle has it, to 1e-8 mm of 12 m."""
+    ray of the stop agrees with the oracle to 1e-8 mm of 12 m."""
     field = np.radians([0.7, 1.2])
     points = hexapolar(4)
     wanted = truth(oracle.Scene.of(lsst, field, INF, [0.5]), points)
@@ -205,7 +206,7 @@ def test_c08_whole_pupil(cases, lsst):
 @pytest.mark.slow
 @pytest.mark.parametrize("gap", [2.0, 0.0, -2.0])
 def test_c13_toroid(cases, gap):
-    """Rays and sag to 1e-11, wherever the stop is that labels them."""
+    """Rays and sag to 1e-11, for any position of the stop that labels them."""
     entry, reference = cases["C13"]["prescription"], cases["C13"]["reference"]
     a1, a2 = entry["a"]
     toroid = {
@@ -238,7 +239,7 @@ LINES = {"D": 5895.944, "C": 6562.816, "F": 4861.344}
 
 
 def wyld(entry, line):
-    """The telescope of C16 with the constant indices of one line."""
+    """The telescope of C16 with the constant indices of one wavelength."""
     part = (LINES["D"] - LINES[line]) / (LINES["C"] - LINES["F"])
     surfaces = []
     for row in entry["surfaces"]:
@@ -307,7 +308,7 @@ def test_p01_ray_fan(cases, p01):
 
 
 def test_p01_first_order(cases, p01):
-    """Half a unit of the last digit printed."""
+    """To half a unit of the last printed digit."""
     reference = cases["P01"]["reference"]["first_order"]
     first = drt_jax.first_order(p01, INF, jnp.array([0.543]))
     np.testing.assert_allclose(first.focal_length, reference["focal_length_cardinal"], atol=5.1e-7)

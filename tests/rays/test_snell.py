@@ -1,4 +1,5 @@
-"""The one intersection routine and the sequential trace: closed forms, and the yardstick."""
+"""The intersection routine and the sequential trace, compared with closed forms and the reference
+trace."""
 
 import functools
 from typing import NamedTuple
@@ -25,7 +26,7 @@ STEPS = 10.0 ** -np.arange(1.0, 7.5, 0.5)
 
 
 def stacked(names):
-    """Shapes of one form, to be broadcast against (shape, ray)."""
+    """Shapes of one form, for broadcasting against (shape, ray)."""
     most = max(len(SHAPES[n][3]) for n in names)
     rows = [np.pad(SHAPES[n][3], (0, most - len(SHAPES[n][3]))) for n in names]
     c, k = (np.array([SHAPES[n][i] for n in names])[:, None] for i in (1, 2))
@@ -33,7 +34,7 @@ def stacked(names):
 
 
 def lines(count, rays=8):
-    """Lines (shape, ray) some mm in front of a vertex, forwards and, every other, backwards;
+    """Lines (shape, ray) some mm in front of a vertex, alternately forwards and backwards;
     directions of any length."""
     generator = np.random.default_rng(0)
     shape = (count, rays)
@@ -47,9 +48,9 @@ def lines(count, rays=8):
 
 
 class Met(NamedTuple):
-    """length, slope, bend: (places, shape, ray), how far a line goes to a surface, and its first
-    and second derivative along a way. met: (shape, ray). miss: (shape, ray), mm, by how much the
-    point misses the surface, which exists there: exists."""
+    """length, slope, bend: (places, shape, ray), length of a line to a surface, and its first and
+    second derivative along a path of the arguments. met: (shape, ray). miss: (shape, ray), distance
+    of the point from the surface, mm, if the surface exists there: exists."""
 
     length: np.ndarray
     slope: np.ndarray
@@ -61,7 +62,7 @@ class Met(NamedTuple):
 
 @functools.partial(jax.jit, static_argnums=0)
 def along_a_way(form, p, d, shape, way, places):
-    """All that is asked of a form: one program."""
+    """All results for a form, in one program."""
     going, side = jnp.ones(p[0].shape, bool), jnp.sign(d[-1])
 
     def at(h):
@@ -84,7 +85,7 @@ def along_a_way(form, p, d, shape, way, places):
 
 @pytest.fixture(scope="module", params=GROUPS)
 def case(request):
-    """Names of shapes, their arguments, and what happens along a random way from these."""
+    """Names of shapes, their arguments, and the results along a random path from these."""
     names = GROUPS[request.param]
     shape, (p, d) = stacked(names), lines(len(names))
     generator = np.random.default_rng(2)
@@ -107,8 +108,8 @@ def test_rays_meet_the_surface(case):
 
 @pytest.mark.parametrize("case", ["conics"], indirect=True)
 def test_conics_against_the_roots_of_their_equation(case):
-    """Of the two points of a conic on a line, the one on the half that holds the vertex, where
-    1 - (1 + k) c z is positive, that the line crosses from the side where its vertex plane lies."""
+    """Of the two points of a conic on a line, the one on the sheet of the vertex, where 1 - (1 + k)
+    c z is positive, which the line crosses from the side on which its vertex plane lies."""
     names, (p, d, shape), found = case
     for i in range(len(names)):
         c, k = shape.curvature[i, 0], shape.conic[i, 0]
@@ -125,8 +126,8 @@ def test_conics_against_the_roots_of_their_equation(case):
 
 
 def test_derivatives_of_the_length(case):
-    """First and second against central differences: of second order in the step until rounding,
-    and there to 1e-9."""
+    """First and second derivatives compared with central differences, whose error is of second
+    order in the step until rounding; the smallest differences are 1e-9."""
     *_, found = case
     count = len(STEPS)
     for function, derivative in ((found.length, found.slope), (found.slope, found.bend)):
@@ -142,7 +143,7 @@ def test_derivatives_of_the_length(case):
 
 
 def test_lines_that_meet_nothing():
-    """Beside a sphere of R = 10, beyond its rim, along a plane."""
+    """Lines that miss a sphere of R = 10, pass beyond its rim, or run along a plane."""
     reach = jax.jit(meet.reach, static_argnums=0)
     shape = Shape(np.array([0.1, 0.1, 0.0]), np.zeros(3), np.zeros((0, 3)))
     p = tuple(np.array(a) for a in ([0.0, 0.0, 0.0], [10.5, 9.9999, 1.0], [-5.0, -5.0, -5.0]))
@@ -158,7 +159,7 @@ yardstick = jax.jit(jax.vmap(trace_snell, (None, None, 0, 0)))
 
 
 def launches(rays=20):
-    """Random points on the vertex plane of the first surface, the same for two colours."""
+    """Random points on the vertex plane of the first surface, the same for two wavelengths."""
     points = np.random.default_rng(0).uniform(-4, 4, (2, 1, rays))
     return tuple(jnp.asarray(np.broadcast_to(points, (2, 2, rays))))
 
@@ -167,7 +168,8 @@ def launches(rays=20):
 @pytest.mark.parametrize("lens", [lens_with("between", True), freeform()], ids=["mirror", "forms"])
 @pytest.mark.parametrize("distance", [DISTANCE, np.inf])
 def test_a_trace_against_the_yardstick(lens, distance):
-    """Hits within 1e-12 mm; and how far rounding them turns a segment."""
+    """Hits within 1e-12 mm; and the change of the direction of a segment by rounding of the
+    hits."""
     system, launch = scene_system(lens, distance), launches()
     trace = shoot(system, launch)
     trace = trace._replace(hits=snell.split_stop(system, trace.hits)[0])
@@ -192,8 +194,8 @@ def test_a_trace_against_the_yardstick(lens, distance):
 
 @pytest.mark.parametrize("stop", ["in front", "active"])
 def test_the_stop_of_a_ray(stop):
-    """The trace to the stop crosses it where the whole trace does, and where the label of the ray
-    says."""
+    """The trace to the stop crosses it at the same point as the whole trace, and as the label of
+    the ray."""
 
     @jax.jit
     def both(system, launch):
@@ -208,8 +210,8 @@ def test_the_stop_of_a_ray(stop):
 
 
 def test_status():
-    """What stops a ray first: a plane glass face beyond the critical angle; the curved one missed;
-    surfaces that cross, so that the second lies behind the ray; all without a number that is not
+    """The first failure of a ray: a plane glass surface beyond the critical angle; a curved surface
+    that is missed; surfaces that cross, so that the second lies behind the ray. All numbers are
     finite."""
     faces = [
         {"radius": "inf", "thickness": 60.0, "index": 1.5, "semi_diameter": 5.0, "stop": True},

@@ -1,5 +1,5 @@
-"""Derivatives of rays: our rule as `attach`, `solve` and `solve_reverse` against each other, finite
-differences, optimistix's own implicit adjoint and the unrolled iteration."""
+"""Derivatives of rays: our rule as `attach`, `solve` and `solve_reverse`, compared with each other,
+with finite differences, with optimistix's own implicit adjoint and with the unrolled iteration."""
 
 import dataclasses
 import functools
@@ -41,10 +41,10 @@ def dots(a, b):
 
 
 def direction(lens, group):
-    """A random direction in one group of leaves, of such a size that 1 is a small change."""
+    """A random direction in one group of leaves, scaled so that 1 is a small change."""
     generator = np.random.default_rng(1)
 
-    # The hits hardly feel less, and its effect would drown in rounding.
+    # A smaller change would have an effect on the hits below rounding.
     least = {"conic": 50.0, "coefficients": 1e-2, "decentre": 3.0, "tilt": 0.3}.get(group, 0.0)
 
     def fill(path, value):
@@ -62,8 +62,8 @@ def direction(lens, group):
     "name", [pytest.param(n, marks=pytest.mark.slow) if n == "tilted" else n for n in PROBLEMS]
 )
 def test_against_finite_differences_of_second_order(name):
-    """Central differences of rays found anew over a swept step: the error falls with slope 2 until
-    rounding, and our derivative is where it points to."""
+    """Central differences of rays that are found anew, for varied steps: the error falls with slope
+    2 until rounding, and its limit is our derivative."""
     lens, scene, points, found = problem(name)
     weights = random_like(found.hits)
     dlens, dscene, _ = gradient(lens, scene, points, found, weights)
@@ -90,7 +90,8 @@ def test_against_finite_differences_of_second_order(name):
         errors = np.array([abs((moved(h) - moved(-h)) / (2 * h) - ours) for h in steps])
         scale = abs(ours) + 1e-9
         assert np.min(errors) < 3e-9 * scale + 1e-9, (group, errors / scale)
-        # Where truncation stands well above rounding, which grows as 1/h: measured at the end.
+        # Steps at which truncation is well above rounding, which is measured at the end and
+        # grows as 1/h.
         rounding = 10 * np.max(errors[-4:] * steps[-4:]) / steps
         clear = np.cumprod(errors > rounding).astype(bool)
         assert np.sum(clear) >= 3 or group == "sensor", (group, errors / scale)  # linear in it
@@ -100,15 +101,15 @@ def test_against_finite_differences_of_second_order(name):
 
 
 def equations(hits, system, target):
-    """F and by how much the rays miss their stop points; both are 0 for rays."""
+    """F, and the distances of the rays from their stop points; both are 0 for rays."""
     path = fermat.geometry(hits, system)
     short = linear.shortfall(path, system, target)
     return tuple(f[:-1] for f in short.residual), short.label
 
 
 def test_against_optimistix():
-    """The gradient by its Newton method for all rays at once, from hits near to them, and its
-    default adjoint."""
+    """The gradient by its Newton method for all rays together, from hits close to the rays, with
+    its default adjoint."""
     given = lens, scene, points, found = problem("meridional")
     weights = random_like(found.hits)
 
@@ -130,7 +131,7 @@ def test_against_optimistix():
 
 @pytest.mark.slow
 def test_against_the_unrolled_iteration():
-    """Tangents through nine steps of Newton's method from hits near to the rays."""
+    """Tangents through nine steps of Newton's method from hits close to the rays."""
     given = lens, scene, points, found = problem("tilted")
 
     @jax.jit
@@ -156,7 +157,7 @@ def test_against_the_unrolled_iteration():
 
 @pytest.mark.slow
 def test_solve_and_solve_reverse_are_one(monkeypatch):
-    """Gradients by the system and the stop points, and those of `attach`: to 1e-12. Both are handed
+    """Gradients by the system and the stop points, and those of `attach`, agree to 1e-12. Both use
     the rays that the search has found."""
     lens, scene, points, found = problem("tilted")
     weights = random_like(found.hits)
@@ -175,15 +176,16 @@ def test_solve_and_solve_reverse_are_one(monkeypatch):
 
 
 def moved_by(change, lens, scene):
-    """A lens and a scene with some of their arrays moved."""
+    """A lens and a scene with some of their arrays changed."""
     lens = dataclasses.replace(lens, **{k: getattr(lens, k) + v for k, v in change.items()})
     return lens, scene
 
 
 @jax.jit
 def second_order(change, way, lens, scene, points, found, weights):
-    """The gradient by a change of the lens, and along `way`; products of the Hessian with `way`:
-    forward over reverse and reverse over reverse; and `way` with it, forward over forward."""
+    """The gradient by a change of the lens, and its product with `way`; products of the Hessian
+    with `way`, forward over reverse and reverse over reverse; and the quadratic form of `way`,
+    forward over forward."""
 
     def value(change):
         return outcome(*moved_by(change, lens, scene), points, found, weights)
@@ -202,8 +204,8 @@ def second_order(change, way, lens, scene, points, found, weights):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["tilted", pytest.param("meridional", marks=pytest.mark.slow)])
 def test_products_with_the_hessian(name):
-    """Three ways, and against differences of the gradient of rays found anew, two steps freed of
-    their h^2 (Richardson): 1e-8 of the largest."""
+    """Three ways agree with each other, and with differences of the gradient of rays that are found
+    anew, extrapolated from two steps (Richardson), to 1e-8 of the largest."""
     lens, scene, points, found = problem(name)
     weights = random_like(found.hits)
     groups = ("curvature", "thickness", "conic", "sensor")
@@ -239,7 +241,7 @@ def pushed(lens, scene, points, found, moving):
 
 
 def tangents_of(*tree):
-    """Random tangents; 0 where there is nothing to move."""
+    """Random tangents; 0 for numbers that cannot change."""
     return jax.tree.map(lambda x, a: jnp.where(jnp.isfinite(a), x, 0), random_like(tree, 1), tree)
 
 
@@ -255,7 +257,7 @@ def test_forward_is_the_transpose_of_reverse():
 
 
 def test_failed_rays_have_no_derivatives_and_change_no_other():
-    """Stop points at infinity, out of reach, and not a number."""
+    """Stop points at infinity, out of reach, and NaN."""
     lens, scene, points, found = problem("tilted")
     for bad in (1e6, 30.0, np.nan, np.inf):
         some = np.array([False, True, False, True, False])

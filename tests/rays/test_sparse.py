@@ -11,7 +11,8 @@ VALUES = 10 * np.arange(3)[:, None] + np.arange(7)
 
 
 def test_the_first_flagged_rays_have_lanes():
-    """Of seven lanes two rays have three each; where one or none is flagged, the last fills up."""
+    """Of seven lanes, two rays have three each; if one ray or none is flagged, the last one fills
+    the others."""
     lanes = Lanes(jnp.asarray(FLAGGED), 3)
     own = lanes.of_rays(jnp.asarray(VALUES))
     assert np.array_equal(own, [[1, 3], [16, 16], [26, 26]])
@@ -25,8 +26,8 @@ def test_the_first_flagged_rays_have_lanes():
 
 @jax.jit
 def first_multiple(flagged, values):
-    """For each flagged ray, as many at once as have room, the first of 24 numbers in a row of which
-    its value is a divisor, found in rounds of 3 lanes; -1 for none."""
+    """For each flagged ray, the first of 24 numbers in a row that its value divides, found in
+    rounds of 3 lanes for as many rays at a time as fit; -1 for none."""
 
     def step(state):
         left, found = state
@@ -43,7 +44,7 @@ def first_multiple(flagged, values):
 
 
 def test_a_search_in_rounds():
-    """Each flagged ray is tried in all its rounds, whatever the others need."""
+    """Each flagged ray gets all of its rounds, independent of the others."""
     generator = np.random.default_rng(1)
     flagged = generator.uniform(size=(4, 11)) < 0.6
     values = generator.integers(2, 60, flagged.shape)

@@ -1,6 +1,6 @@
-"""The stop is a label: lenses whose stop lies at, behind or inside of what bends light.
+"""The stop is a label: lenses whose stop lies at, behind or inside of active surfaces.
 
-The truth is the sequential trace of `oracle`, which is aimed at the label by itself.
+The reference is the sequential trace of `oracle`, which has its own aiming at the label.
 """
 
 import dataclasses
@@ -30,7 +30,7 @@ WHOLE = hexapolar(10)  # 331 rays
 CHOSEN = (0, 60, 300)
 FEW = hexapolar(4)  # 61 rays
 PICKED = (0, 2, 30, 50)
-# Of the largest derivative of an output by an array of parameters.
+# Relative to the largest derivative of an output by an array of parameters.
 SLOPES = 1e-9
 
 
@@ -49,8 +49,8 @@ def scenes(name, **where):
 
 
 def misaligned(lens, seed=0):
-    """The lens with all surfaces, the stop among them, and the sensor moved by some 5 um and
-    2 mrad at random."""
+    """The lens with all surfaces, among them the stop, and the sensor moved at random by some 5 um
+    and 2 mrad."""
     generator = np.random.default_rng(seed)
     moves = {"decentre": 5e-3, "tilt": 2e-3}
     moves = {k: s * generator.normal(size=getattr(lens, k).shape) for k, s in moves.items()}
@@ -59,8 +59,8 @@ def misaligned(lens, seed=0):
 
 @pytest.mark.slow
 def test_every_ray_of_the_phone_lenses():
-    """12 lenses, 5 fields, 331 rays over the whole stop: what the oracle finds is found and
-    nothing else, points and paths within 1e-11 mm, 2.5e-12 of the focal length."""
+    """12 lenses, 5 fields, 331 rays over the whole stop: the rays that the oracle finds are found
+    and no others, points and paths within 1e-11 mm, 2.5e-12 of the focal length."""
     every = [(name, *scene) for name in phones.LENSES for scene in scenes(name)]
     wanted = truth(oracle.Scene.stack([scene_of(*scene) for _, *scene in every]), WHOLE)
     assert np.mean(wanted.exists) > 0.99
@@ -71,8 +71,8 @@ def test_every_ray_of_the_phone_lenses():
 @pytest.mark.slow
 @pytest.mark.parametrize("name", phones.LENSES)
 def test_derivatives_of_the_phone_lenses(name):
-    """Sensor points and paths of rays at 30 degrees by every parameter, the stop's place, size,
-    tilt and decentre among them, against the complex step."""
+    """Sensor points and paths of rays at 30 degrees by every parameter, among them position, size,
+    tilt and decentre of the stop, compared with the complex step."""
     lens, field = misaligned(phones.load(name)), np.radians([4.0, 30.0])
     rays, slopes = ours(lens, field)
     assert np.all(rays.status[0, np.array(CHOSEN)] == Status.OK)
@@ -83,14 +83,16 @@ def test_derivatives_of_the_phone_lenses(name):
 
 
 def slid(name, place, positions):
-    """A lens with its stop at `positions` (P,) mm behind the vertex after it; the rest stays."""
+    """A lens with its stop at `positions` (P,) mm behind the vertex after it; all other surfaces
+    stay."""
     lenses = [phones.load(name, position=p, place=place) for p in positions]
     return lenses, [scene_of(lens, np.radians([0.0, 20.0])) for lens in lenses]
 
 
 def along_the_slide(slopes, lens):
-    """Derivative of the outputs by the place of the stop while all others stay: listed first,
-    it is the origin, from which the sensor's place and the path are counted."""
+    """Derivative of the outputs by the position of the stop while all other surfaces stay. A stop
+    that is listed first is the origin from which the position of the sensor and the path are
+    measured."""
     thickness, sensor = of_row(slopes, "thickness"), of_row(slopes, "sensor")
     if lens.stop == 0:
         return -thickness[:, 0] - sensor
@@ -107,8 +109,8 @@ def along_the_slide(slopes, lens):
     ],
 )
 def test_the_stop_slides_through_a_surface(name, place, part):
-    """From 0.6 mm before to 0.6 mm behind the vertex of the first surface, or of the second
-    element: no ray is lost, and the hits and their derivatives run smoothly."""
+    """From 0.6 mm in front of to 0.6 mm behind the vertex of the first surface, or of the second
+    element: no ray is lost, and the hits and their derivatives are smooth."""
     positions = np.linspace(-0.6, 0.6, 25)
     pupil, picked = part * WHOLE, np.array(CHOSEN)
     lenses, every = slid(name, place, positions)
@@ -122,7 +124,7 @@ def test_the_stop_slides_through_a_surface(name, place, part):
         by_place = along_the_slide(slope, lens).reshape(len(CHOSEN), 3)
         slopes.append(by_place[:, :2].ravel())
     heights, slopes, step = np.array(heights), np.array(slopes), positions[1] - positions[0]
-    # What a step adds is the mean derivative of its ends, up to h^3 / 12 f'''.
+    # The change over a step is h times the mean derivative at its ends, up to h^3 / 12 f'''.
     jump = heights[1:] - heights[:-1] - step / 2 * (slopes[1:] + slopes[:-1])
     assert np.max(np.abs(jump)) <= 0.1 * step**3
     for array in (heights, slopes):
@@ -170,7 +172,7 @@ BEHIND = {
 @pytest.mark.slow
 @pytest.mark.parametrize("where", BEHIND)
 def test_stop_listed_behind_everything(where):
-    """The label is on the line from the last surface to the sensor, prolonged either way; here a
+    """The label is on the line from the last surface to the sensor, extended both ways; here a
     curved and tilted one. Object at 150 mm."""
     gap, tilt = BEHIND[where]
     stop = {"radius": -40, "conic": 0.3, "semi_diameter": 2.0, "stop": True, "tilt": [tilt, 2, 0]}

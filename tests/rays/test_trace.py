@@ -1,4 +1,5 @@
-"""Traced rays against Snell's law; other programs' digits are in test_reference_cases.py."""
+"""Traced rays compared with Snell's law; digits of other programs are in
+test_reference_cases.py."""
 
 import dataclasses
 
@@ -20,7 +21,7 @@ from ..known import known, search
 
 POINTS = pupil.half_disc(4, 5)[0]
 SINGLET = load_lens("singlet")
-# Twenty rays of three colours in all tests of one lens: one program.
+# Twenty rays at three wavelengths in all tests of one lens: one program.
 HEIGHTS = np.stack([np.zeros(20), np.linspace(-1, 1, 20)], axis=1)
 
 
@@ -67,7 +68,7 @@ def against_snell(lens, rays, field, distance, wavelengths):
 
 
 def asphere():
-    """Aspheres of many orders about the stop."""
+    """Aspheres of many orders on both sides of the stop."""
     surfaces = [
         {"radius": 30, "conic": -0.8, "coefficients": {4: 2e-6, 6: -4e-9}, "thickness": 6},
         {"radius": -200, "coefficients": {2: 1e-4, 4: 1e-5}, "thickness": 3},
@@ -149,7 +150,7 @@ def test_forms_that_equal_others_have_the_same_gradients():
 
 @pytest.mark.slow
 def test_float32_hits_within_a_tenth_of_a_micrometre():
-    """Also for an object 25 m away, off axis, where other tracers lose 24 um in float32."""
+    """Also for an object at 25 m, off axis, where other tracers have errors of 24 um in float32."""
     lens = load_lens("double_gauss")
     single = jax.tree.map(lambda a: a.astype(jnp.float32), lens)
     for distance in (np.inf, 25000.0):
@@ -176,7 +177,7 @@ def test_distance_is_continuous_to_infinity():
 
 
 def with_dummy(lens, gap, curvature):
-    """`lens` with a surface of the given curvature halfway across a gap, doing nothing."""
+    """`lens` with a surface of the given curvature in the middle of a gap, which bends no light."""
     i = gap + 1
     half = lens.thickness[gap] / 2
 
@@ -248,8 +249,9 @@ def test_failed_rays_carry_a_status_and_no_nan():
 
 @pytest.mark.slow
 def test_failed_rays_change_no_gradient():
-    """Rays that miss the exit face or are totally reflected there, or whose wavelength is outside
-    the glass, beside those that pass; by the call that everyone uses, in reverse mode."""
+    """Rays that miss the exit surface or are totally reflected there, or whose wavelength is
+    outside the range of the glass, together with rays that arrive; by the usual call, in reverse
+    mode."""
     bent = singlet(
         curvature=[0.0, 0.0, -0.02, 0.0],
         thickness=[2.0, 60.0],
@@ -286,8 +288,8 @@ def test_bad_requests():
 
 
 def test_directions_and_paraxial_launch():
-    """A lens whose stop is its first surface: its entrance pupil is the stop itself, so that
-    aiming at it paraxially finds the same rays; directions are those between the points."""
+    """A lens whose stop is its first surface: its entrance pupil is the stop, so that rays aimed at
+    it paraxially are the same; directions are those between the points."""
     for distance in (jnp.inf, 400.0):
         rays = trace_rays(SINGLET, Scene.point(0.1, distance, RGB), HEIGHTS)
         start, direction = launch_paraxial(SINGLET, 0.1, distance, RGB[0], jnp.asarray(HEIGHTS))
@@ -302,7 +304,7 @@ def test_directions_and_paraxial_launch():
 
 @pytest.mark.slow
 def test_bundles_of_nearly_as_many_rays_share_a_program():
-    """Outside of `jit`, in eager derivatives too: each ray is what it is in any bundle."""
+    """Outside of `jit`, also in eager derivatives: each ray is the same in any bundle."""
 
     def arrive(field, count):
         return trace_rays(SINGLET, Scene.point(field, jnp.inf, RGB), HEIGHTS[:count]).points[
@@ -320,7 +322,7 @@ def test_bundles_of_nearly_as_many_rays_share_a_program():
 
 
 def test_the_chief_ray_alone_through_a_stop_at_the_first_mirror():
-    """Nothing but the field tells the size of the beam: a Mersenne telescope, its chief ray."""
+    """Only the field determines the size of the beam: the chief ray of a Mersenne telescope."""
     rows = [
         {"radius": -200, "conic": -1, "mirror": True, "stop": True, "thickness": -75.0},
         {"radius": -50, "conic": -1, "mirror": True},

@@ -22,7 +22,7 @@ VIRTUAL = "prolonged backwards to a virtual image"
 
 
 def seen_from_air(sensor):
-    """A point in glass, seen through a concave sphere: its image lies behind the point."""
+    """A point in glass, seen through a concave sphere, whose image lies behind the point."""
     rows = [{"radius": -R, "index": 1.0, "thickness": sensor}]
     return behind_stop(rows, GAP, 1.0, object={"index": N})
 
@@ -39,7 +39,7 @@ DISTANCE = R * (1 + 1 / N) - GAP
 
 @pytest.mark.slow
 def test_an_aplanatic_virtual_image(virtual):
-    """All rays seem to come from one point, run forwards and have one path."""
+    """All rays seem to come from one point, run forwards and have equal paths."""
     rays = trace_rays(virtual, Scene.point(0.0, DISTANCE, [0.55]), on_y(*HEIGHTS))
     np.testing.assert_array_equal(rays.status, Status.OK)
     np.testing.assert_allclose(rays.points[0, :, -1, :2], 0, atol=1e-12)
@@ -54,7 +54,8 @@ def test_an_aplanatic_virtual_image(virtual):
 
 @pytest.mark.slow
 def test_an_aplanatic_virtual_object():
-    """Light in air that converges to a point 25 mm behind a glass sphere meets in it."""
+    """Light in air that converges to a point 25 mm behind a glass sphere meets inside the
+    sphere."""
     rows = [{"radius": R, "index": N, "thickness": R * (1 + 1 / N)}]
     lens = behind_stop(rows, GAP, 1.0)
     distance = -(R * (1 + N) + GAP)
@@ -70,7 +71,8 @@ def test_an_aplanatic_virtual_object():
 
 @pytest.mark.slow
 def test_derivatives_of_virtual_images(virtual):
-    """Forward and reverse, by the curvature and the place of the sensor, against differences."""
+    """Forward and reverse, by the curvature and the position of the sensor, compared with
+    differences."""
 
     def spot(curvature, sensor):
         lens = dataclasses.replace(
@@ -113,7 +115,7 @@ def test_no_object_at_the_first_vertex(virtual):
 
 @pytest.mark.slow
 def test_minus_infinity_is_infinity():
-    """Light of an object at infinity is parallel, wherever it is said to lie."""
+    """Light of an object at infinity is parallel, for either sign of the distance."""
 
     @jax.jit
     def found(lens, distance):

@@ -1,5 +1,5 @@
 """One compiled program for rays and their derivatives, the comparison with the oracle, and lenses
-whose rays are labelled in front of them."""
+whose stop is listed first."""
 
 import functools
 from typing import NamedTuple
@@ -27,9 +27,9 @@ def hexapolar(rings):
 
 
 def rays_and_derivatives(lens, field, distance, pupil, chosen):
-    """Rays of one colour through `pupil`, and the derivatives by (lens, field) of the outputs of
-    those numbered `chosen`: a lens and a field with a leading axis (chosen, x, y and path). By all
-    numbers of the lens: nothing is held."""
+    """Rays of one wavelength through `pupil`, and the derivatives by (lens, field) of the outputs
+    with the numbers `chosen`: a lens and a field with leading axes (chosen; x, y and path).
+    Derivatives are by all numbers of the lens: none is held."""
     return _both(freed(lens), field, distance, pupil, chosen)
 
 
@@ -47,8 +47,8 @@ def _both(lens, field, distance, pupil, chosen):
 
 
 class Truth(NamedTuple):
-    """Rays by the oracle: points (..., W, Q, S + 1, 3) along the axes of the lens; heights, how
-    far they are from the axes of the surfaces (..., W, Q, S + 1); path (..., W, Q); exists."""
+    """Rays by the oracle: points (..., W, Q, S + 1, 3) along the axes of the lens; heights,
+    distances from the axes of the surfaces (..., W, Q, S + 1); path (..., W, Q); exists."""
 
     points: np.ndarray
     heights: np.ndarray
@@ -66,7 +66,7 @@ def truth(scene, pupil):
 
 
 def oracle_slopes(scene, pupil, rows):
-    """{row: derivatives of x, y and path as those of `rays_and_derivatives`} by complex steps."""
+    """{row: derivatives of x, y and path as in `rays_and_derivatives`} by complex steps."""
     start = oracle._aimed(scene, pupil.T)
     slopes = {}
     for row in rows:
@@ -92,8 +92,9 @@ def of_row(slopes, row):
 
 
 def assert_same_slopes(ours, wanted, rtol, where=""):
-    """Derivatives of x, y and path by each array within `rtol` of the largest one, over rays, of
-    that output by that array: what is 0 by geometry holds rounding alone."""
+    """Asserts that derivatives of x, y and path by each array agree within `rtol` of the largest
+    one, over rays, of this output by this array; derivatives that are 0 by geometry are only
+    rounding error."""
     for row, reference in wanted.items():
         got = of_row(ours, row)
         assert got.shape == reference.shape and np.all(np.isfinite(got)), (where, row)
@@ -107,7 +108,8 @@ def assert_same_slopes(ours, wanted, rtol, where=""):
 
 
 def assert_same_rays(rays, wanted, atol, where=""):
-    """Every ray of a `Truth` is found, its points and path within `atol` mm, and no other."""
+    """Asserts that every ray of a `Truth` is found, with points and path within `atol` mm, and no
+    other ray."""
     status, exists = np.asarray(rays.status), wanted.exists
     lost, made_up = exists & (status != Status.OK), ~exists & (status == Status.OK)
     assert not np.any(lost), f"{where}: {np.sum(lost)} of {np.sum(exists)} lost: {status[lost]}"
@@ -120,7 +122,8 @@ def assert_same_rays(rays, wanted, atol, where=""):
 
 
 def behind_stop(surfaces, gap, semi_diameter, **top):
-    """The lens of `surfaces` with a stop plane `gap` mm before its first vertex, listed first."""
+    """The lens of `surfaces` with a stop plane `gap` mm in front of its first vertex, listed
+    first."""
     plane = {"curvature": 0, "thickness": gap, "semi_diameter": semi_diameter, "stop": True}
     return load_lens({"surfaces": [plane | top.get("object", {}), *surfaces], **top})
 

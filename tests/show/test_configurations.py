@@ -1,4 +1,4 @@
-"""Configurations under each other: one scale, one set of rims, their numbers in a table."""
+"""Configurations below each other: one scale, one set of rims, their numbers in a table."""
 
 import jax.numpy as jnp
 import numpy as np

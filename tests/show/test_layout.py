@@ -1,4 +1,4 @@
-"""What is drawn lies where the rays are."""
+"""Drawings agree with the rays."""
 
 import dataclasses
 
@@ -112,8 +112,9 @@ def test_the_picture_holds_every_line_and_says_which_field_has_which_colour(fold
 
 @pytest.mark.slow
 def test_an_element_has_one_rim_and_its_planes_are_planes():
-    """The plane and the sphere of a piece end at the larger of their semi-diameters; the sphere is
-    continued by a plane at its own; where that plane crosses the other face, rims stay apart."""
+    """The plane and the sphere of an element end at the larger of their semi-diameters. A plane
+    continues the sphere beyond its own semi-diameter; if this plane crosses the other surface, the
+    rims stay separate."""
     face = {"radius": 20.0, "thickness": 4, "glass": "N-BK7", "semi_diameter": 5, "stop": True}
     plane = {"radius": "inf", "semi_diameter": 8.0}
     lens = load_lens({"surfaces": [face, plane], "sensor": 40})
@@ -144,8 +145,8 @@ RIMS = {
 
 @pytest.mark.slow
 def test_the_edges_of_a_vignetted_beam_are_drawn():
-    """Its lower edge ray passes at the rim of the plane before the stop, its upper one at that of
-    the surface behind it; both are rays more than the fan has."""
+    """The lower edge ray passes the rim of the plane in front of the stop, the upper one that of
+    the surface behind it. Both are additional to the rays of the fan."""
     lens = load_lens(RIMS)
     axial, oblique = show.draw(lens, Scene.radians([0.0, 0.1])).rays
     assert len(axial) == 7
@@ -175,7 +176,8 @@ def test_the_light_between_an_obscuration_and_the_rim_has_four_edges():
 
 @pytest.mark.slow
 def test_a_steep_ray_does_not_leave_the_picture():
-    """It begins where it has come twice as far as the plane before the lens is away."""
+    """Its length in front of the lens is twice the distance of the plane at which other rays
+    start."""
     axial, steep = show.draw(load_lens("fisheye_8mm"), Scene.radians([0.0, 1.3]), rays=3).rays
     begin, corner = steep[1][:2]
     assert np.tan(1.3) == pytest.approx((corner[1] - begin[1]) / (corner[0] - begin[0]))
@@ -201,6 +203,6 @@ def test_a_beam_tells_who_clips_it_and_where_it_is_sharp(tilted):
 
 
 def test_a_notebook_shows_a_figure():
-    """IPython asks the last value of a cell for its pictures."""
+    """IPython requests the figures of the last value of a cell."""
     figure, _ = show.new()
     assert figure._repr_png_().startswith(b"\x89PNG")

@@ -1,4 +1,4 @@
-"""Pages of HTML: what they hold, and how they look in a browser."""
+"""HTML pages: their content, and their look in a browser."""
 
 import pathlib
 import re
@@ -75,8 +75,8 @@ TYPED = {
 
 
 def test_a_lens_can_be_typed_in_again():
-    """Every number of the file stands in the tables: glass to five digits, coefficients by power,
-    tilts in degrees."""
+    """The tables have every number of the file: glass to five digits, coefficients by power, tilts
+    in degrees."""
     lens = load_lens(TYPED)
     tables = show.prescription(lens)
     row = tables["Surfaces"][1]
@@ -98,8 +98,8 @@ def test_a_lens_can_be_typed_in_again():
 @pytest.mark.slow
 @pytest.mark.skipif(not BROWSER, reason="no browser: apt-get install chromium")
 def test_a_browser_shows_the_sheet_at_three_widths(tmp_path, capsys, write_tables):
-    """Every analysis is drawn, and nothing reaches beyond the screen or its own frame. With
-    --write-tables the pictures are kept in results/pages."""
+    """Every analysis is drawn, and nothing extends beyond the screen or its own frame. With
+    --write-tables the figures are written to results/pages."""
     page = tmp_path / "lens.html"
     words = ["show", "cooke_triplet", "--html", "--field", "0", "14", "20", "--out", str(page)]
     main(words)

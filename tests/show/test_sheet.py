@@ -1,4 +1,4 @@
-"""Pictures of analyses show what was computed."""
+"""Figures of analyses show the computed numbers."""
 
 import dataclasses
 
@@ -28,7 +28,8 @@ def test_colours_run_from_blue_to_red():
 
 
 def test_a_colour_is_a_field_or_a_wavelength():
-    """Colours of fields are no mixture of those of wavelengths, blue to green to red."""
+    """Colours of fields differ from all colours between those of wavelengths, blue to green to
+    red."""
     ramp = np.array([to_rgb(c) for c in analyses.colours(np.linspace(0.4, 0.7, 101))])
     for hue in FIELD_COLOURS:
         assert np.min(np.linalg.norm(ramp - to_rgb(hue), axis=1)) > 0.15
@@ -68,7 +69,7 @@ def test_curves_hold_the_numbers():
 
 @pytest.mark.slow
 def test_what_is_not_finite_is_left_out():
-    """A spot without light, a fan whose ends are clipped."""
+    """A spot without light, and a fan with clipped ends."""
     lens = dataclasses.replace(LENS, semi_diameter=LENS.semi_diameter.at[0].set(5.0))
     fans = drt_jax.ray_fans(lens, Scene.radians([0.0, 0.3], np.inf, WAVES), 9)
     _, axes = show.new()
@@ -99,7 +100,7 @@ def test_scales_are_round_and_hold_every_number():
 
 
 def test_frequencies_end_where_contrast_does():
-    """At 200 cycles/mm, at the limit, or for a telescope of 28 um at 100."""
+    """At 200 cycles/mm, at the diffraction limit, or for a telescope of 28 um at 100."""
     assert highest(900.0, np.array([0.005, np.inf])) == 200
     assert highest(150.0, np.array([0.005])) == 150 and highest(0.0, np.array([1e-9])) == 200
     assert highest(570.0, np.array([0.028, 0.147])) == 100
@@ -121,7 +122,7 @@ def test_fans_have_one_scale_with_symbols_and_units():
 
 
 def test_bars_are_third_order_aberrations_of_each_surface_and_their_sum():
-    """Each bar is as long as its number in units of the distance of two lines, which the label
+    """The length of each bar is its number in units of the distance of two lines, which the label
     gives in mm."""
     parts = [np.array([[1.0], [-3.0]]) * 1e-3 * k for k in range(1, 9)]
     _, axes = show.new()
@@ -137,7 +138,7 @@ def test_bars_are_third_order_aberrations_of_each_surface_and_their_sum():
 
 
 def test_further_graphs_hold_their_numbers():
-    """Of numbers that are made up, so that nothing is traced."""
+    """With invented numbers, so that nothing is traced."""
     draw = lambda of, *args: of(show.new()[1], *args)  # noqa: E731
     found = AxialColour(np.array([0.1, -0.1]), np.array([[0.2, np.inf], [0.3, 0.4]]))
     axes = draw(show.longitudinal, found, [0.5, 1.0], (0.5, 0.6))
@@ -170,7 +171,8 @@ def test_further_graphs_hold_their_numbers():
 
 @pytest.mark.slow
 def test_the_numbers_of_a_sheet_are_those_of_the_analyses():
-    """With the weights of the scene; contrast against `transfer` on cells of its own choice."""
+    """With the weights of the scene; contrast agrees with `transfer` with its own choice of
+    cells."""
     scene = Scene.radians([0.3, 0.0], np.inf, WAVES, wavelength_weights=(1.0, 3.0, 0.0))
     found = analysed(LENS, scene, None, lambda what: None)
     assert found.names == ["0°", "17.19°"] and not found.left_out
@@ -185,8 +187,8 @@ def test_the_numbers_of_a_sheet_are_those_of_the_analyses():
     assert np.max(np.abs(np.asarray(plain[1] - end))) > 0.01  # weights count
     spots = drt_jax.spot_diagram(LENS, found.scene)
     np.testing.assert_allclose(found.spots.rms[:2], spots.rms, rtol=1e-3)
-    # Rays evenly over the stop show the light: their RMS radius is that of the spot, but for the
-    # number of rays.
+    # Rays that fill the stop evenly show the light: within the error of their number, their RMS
+    # radius is that of the spot.
     middle = found.hits[:, 1] - found.hits[:, 1].mean(axis=1, keepdims=True)
     size = np.sqrt(np.mean(np.sum(middle**2, axis=-1), axis=1))
     alone = drt_jax.spot_diagram(LENS, Scene.radians([0.0, 0.3], np.inf, WAVES[1])).rms
@@ -215,7 +217,7 @@ def test_further_panels(tmp_path):
 
 @pytest.mark.slow
 def test_a_sheet_has_all_panels():
-    """Also of the axis alone, and of a lens that passes no light at one of its fields."""
+    """Also for an axial field alone, and for a lens that passes no light at one of its fields."""
     for fields, count in (([0.0, 0.1, 0.2, 0.3], 29), ([0.0], 14)):
         said: list[str] = []
         figure = show.sheet(LENS, Scene.radians(fields, np.inf, WAVES), say=said.append)

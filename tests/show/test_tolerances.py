@@ -1,4 +1,4 @@
-"""Pictures of tolerances, by what stands on their axes."""
+"""Figures of tolerances, by the numbers on their axes."""
 
 import numpy as np
 import pytest

@@ -81,7 +81,8 @@ class Ends:
 
 
 def test_overrides_count_all_at_once(tmp_path):
-    """Settings that are right only together, in any order; of a key given twice the last."""
+    """Settings that are valid only together, in any order; of several values for a key, the last
+    one."""
     (tmp_path / "ends.yaml").write_text("")
     load = functools.partial(load_config, Ends, tmp_path / "ends.yaml")
     assert load(["low=5", "high=4", "high=6"]) == load(["high=6", "low=5"]) == Ends(5.0, 6.0)

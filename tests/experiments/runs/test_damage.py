@@ -1,5 +1,5 @@
-"""A run folder that is damaged, or that another process works in: refused in one line that names
-the file and the way on, or mended where nothing is lost."""
+"""A run folder that is damaged, or in which another process works: an error of one line that names
+the file and the remedy, or a repair if nothing is lost."""
 
 import dataclasses
 import json
@@ -50,7 +50,7 @@ def folder(tmp_path):
 
 
 def refused(call, *words):
-    """The one line with which a call refuses."""
+    """The error of a call, which must have one line."""
     with pytest.raises(ConfigError) as found:
         call()
     line = str(found.value)
@@ -66,7 +66,7 @@ def resumed(folder, job="a"):
 
 @pytest.mark.parametrize("content", [b"", HEADER[:3], HEADER[:-1], HEADER, None], ids=repr)
 def test_metrics_without_rows_are_said_and_the_job_can_begin_anew(folder, content):
-    """As a kill left them, or a full disk, before the header came with the folder."""
+    """The file is as after a kill, or on a full disk, before the header was written."""
     path = folder / "metrics.csv"
     path.unlink() if content is None else path.write_bytes(content)
     words = "metrics.csv: not one row of a for each of the 4 steps", "delete checkpoints/a.npz"
@@ -134,7 +134,7 @@ def test_rows_missing_before_the_checkpoint_are_said(folder, old, new):
 
 
 def test_rows_come_whole_or_not_at_all(folder):
-    """A disk that fills in the middle of some rows."""
+    """The disk becomes full while rows are written."""
     path = folder / "metrics.csv"
     before = path.read_bytes()
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
@@ -151,7 +151,7 @@ def test_rows_come_whole_or_not_at_all(folder):
 
 
 def rewritten(path, leaves=None, **changes):
-    """The checkpoint with some parts changed, and the checksum that belongs to them."""
+    """The checkpoint with some parts changed, and with a correct checksum."""
     about, own = unpacked(path.read_bytes())
     path.write_bytes(packed(about | changes, own if leaves is None else leaves))
 
@@ -186,7 +186,7 @@ def test_a_checkpoint_of_something_else_is_refused(folder, changes, words):
 
 
 def test_a_checkpoint_of_another_job_or_other_settings_is_refused(folder):
-    """A file copied over; config.yaml edited."""
+    """A file is copied over it; config.yaml is edited."""
     path = folder / "checkpoints" / "a.npz"
     whole = path.read_bytes()
     path.write_bytes((folder / "checkpoints" / "b.npz").read_bytes())
@@ -217,7 +217,7 @@ def test_a_damaged_checkpoint_is_refused(folder):
 
 
 def test_no_flipped_bit_of_a_checkpoint_passes(folder):
-    """Refused, or in a byte that says nothing: the same numbers."""
+    """The checkpoint is refused or, if the byte has no meaning, gives the same numbers."""
     whole = (folder / "checkpoints" / "a.npz").read_bytes()
     wanted, passed = unpacked(whole), 0
     for k in range(0, len(whole), 5):
@@ -251,7 +251,7 @@ time.sleep(60)
 
 
 def test_one_process_at_a_time_works_in_a_folder(folder):
-    """The lock of one that is killed is gone with it."""
+    """The lock of a process that was killed is removed."""
     command = [sys.executable, "-c", HOLDER, str(folder)]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as other:
         assert other.stdout.readline() == "open\n"

@@ -1,4 +1,4 @@
-"""The folder of a run: what is written comes back, and a run goes on where it was."""
+"""The folder of a run: what is written is read back, and a run continues from its checkpoint."""
 
 import dataclasses
 import json
@@ -47,7 +47,7 @@ def test_metrics_beyond_the_checkpoint_are_dropped(tmp_path):
             run.log("b, 5 deg", start, rows(2))
         run.save("a", 2, jnp.ones(1))
     with open(run.folder / "metrics.csv", "a") as file:
-        file.write("a,4,0.5,13")  # a line cut off by a kill
+        file.write("a,4,0.5,13")  # an incomplete line, after a kill
     with opened(tmp_path, resume=True) as again:
         assert again.load("a", jnp.ones(1), ("a",), 10)[0] == 2
         assert again.metrics("a")["step"].tolist() == [0, 1]
@@ -57,7 +57,7 @@ def test_metrics_beyond_the_checkpoint_are_dropped(tmp_path):
 
 
 def test_the_metrics_of_a_finished_run_do_not_tell_where_it_was_stopped(tmp_path):
-    """Jobs that are trained together are logged by turns, as many steps at once as it happened."""
+    """Jobs that are trained together are logged alternately, with any number of steps at a time."""
     kept = {name: np.arange(6.0) / 7 for name in ("loss", "sensor_mm")}
     files = []
     for ends in ((6,), (1, 4, 6)):
@@ -71,7 +71,7 @@ def test_the_metrics_of_a_finished_run_do_not_tell_where_it_was_stopped(tmp_path
 
 
 def test_seconds_are_counted_once(tmp_path, monkeypatch):
-    """A job read back by the process that kept it adds nothing; one of an earlier process does."""
+    """A job that the same process has written adds no time; one of an earlier process does."""
     clock = iter(range(0, 1000, 10))
     monkeypatch.setattr("time.perf_counter", lambda: float(next(clock)))
     with opened(tmp_path) as run:
@@ -85,7 +85,8 @@ def test_seconds_are_counted_once(tmp_path, monkeypatch):
 
 
 def test_what_a_job_found_is_kept_with_its_metrics(tmp_path):
-    """Also under a name that is no name of a file; what was logged by one cut short is dropped."""
+    """Also for a job whose name is not valid as the name of a file; the metrics of an interrupted
+    job are dropped."""
     found = {"rows": [1, "x", None], "bad": float("inf")}
     with opened(tmp_path) as run:
         assert run.kept("../lens.yaml") is None
@@ -156,7 +157,7 @@ def test_clear_errors(tmp_path):
 
 
 def test_results_are_json_always(tmp_path):
-    """null for what is not finite, which is named."""
+    """Numbers that are not finite become null, and are listed."""
     found = {
         "good": 1.5,
         "none": None,

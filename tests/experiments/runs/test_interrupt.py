@@ -1,4 +1,4 @@
-"""Ctrl-C, heard where stopping is safe; a signal that is ignored stays so."""
+"""Ctrl-C is handled when the run can stop safely; a signal that is ignored stays ignored."""
 
 import os
 import signal
@@ -12,7 +12,8 @@ from experiments.runs.interrupt import deferred_interrupt
 
 
 def press_ctrl_c():
-    """KeyboardInterrupt where the handler raises it; a handler runs between two bytecodes."""
+    """KeyboardInterrupt at the place where the handler raises it; a handler runs between two
+    bytecodes."""
     os.kill(os.getpid(), signal.SIGINT)
     time.sleep(0.05)
 
@@ -52,7 +53,8 @@ assert signal.getsignal(signal.SIGTERM) == handler
     ids=["a run", "these tests"],
 )
 def test_an_ignored_interrupt_stays_ignored(command):
-    """As `nohup` starts a program: the run goes on, and the test above neither fails nor waits."""
+    """As when `nohup` starts a program: the run continues, and the test above neither fails nor
+    waits."""
     started = ["sh", "-c", 'trap "" INT; exec "$@"', "sh", *command]
     done = subprocess.run(started, timeout=100, capture_output=True, text=True)
     assert done.returncode == 0, done.stdout + done.stderr
