@@ -38,6 +38,11 @@ else:
         """
 
 
+def array(values: object) -> Array:
+    """Numbers as an array of the default floating dtype, made without any compilation."""
+    return jax.device_put(np.asarray(values, jnp.result_type(float)))
+
+
 def safe_sqrt(x: Array) -> Array:
     """Square root of `x`; 0, with derivative 0, where `x` <= 0.
 

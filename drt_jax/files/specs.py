@@ -26,8 +26,9 @@ from ..lens.paraxial import (
 )
 from ..lens.phase import Phase
 from ..lens.scene import D_LINE
+from ..numerics import array
 from .apertures import apertures_of, semi_diameter
-from .entry import STEEP, WIDE, Entry, LensError, array, require, table
+from .entry import STEEP, WIDE, Entry, LensError, require, table
 
 SURFACES = 5000  # surfaces
 _ELEMENTS = 500

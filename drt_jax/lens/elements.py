@@ -55,10 +55,8 @@ class Elements:
             turn = rotation_matrix(self.tilt[g])
             pivot = jnp.zeros_like(point[:1]).at[:, 2].set(axis[self.about[g]] + self.pivot[g])
             moved = pivot + self.shift[g][None] + matmul(point[own] - pivot, turn.T)
-            point, rotation = (
-                point.at[own].set(moved),
-                rotation.at[own].set(matmul(turn[None], rotation[own])),
-            )
+            point = point.at[own].set(moved)
+            rotation = rotation.at[own].set(matmul(turn[None], rotation[own]))
         return point, rotation
 
 

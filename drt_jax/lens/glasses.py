@@ -178,11 +178,8 @@ def flaw(glass: Glass) -> str:
     waves = np.linspace(low, high, 257)
     with np.errstate(all="ignore"):
         wrong = waves[~(indices(glass, waves) > 1)]
-    return (
-        f"no index above 1 at {wrong[0]:g} um; mend the constants or the range"
-        if len(wrong)
-        else ""
-    )
+    remedy = "mend the constants or the range"
+    return f"no index above 1 at {wrong[0]:g} um; {remedy}" if len(wrong) else ""
 
 
 def map_point(glass: Glass) -> tuple[float, float] | None:

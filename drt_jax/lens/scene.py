@@ -245,10 +245,8 @@ def checked_scene(lens: Lens, scene: Scene) -> Scene:
     try:
         np.broadcast_shapes(field.shape[:-1], distance.shape)
     except ValueError:
-        raise ValueError(
-            f"distance: expected one, or one for each of the fields {field.shape[:-1]}, got shape "
-            f"{distance.shape}"
-        ) from None
+        what = f"distance: expected one, or one for each of the fields {field.shape[:-1]}"
+        raise ValueError(f"{what}, got shape {distance.shape}") from None
     return Scene(field, distance, waves, weights, scene.field_weights)
 
 
