@@ -104,10 +104,8 @@ def _places(problem: Problem) -> list[tuple[int, ...]]:
     first = {row: row for row in model_glasses(variables.lens)}
     for (k, follower), line in zip(variables.ties, variables.lines.tolist(), strict=True):
         if follower.kind in ("index", "abbe"):
-            require(
-                line == [1, 0],
-                f"snap_glasses: {follower} is tied with a scale or shift; leave this tie out",
-            )
+            what = f"snap_glasses: {follower} is tied with a scale or shift; leave this tie out"
+            require(line == [1, 0], what)
             first[follower.row] = variables.places[k].row
     require(first, "snap_glasses: the lens has no model glass; see with_model_glass")
     return [tuple(r for r in first if first[r] == row) for row in sorted({*first.values()})]
@@ -145,10 +143,8 @@ def _with_glass(
         for k, (kind, row, _) in enumerate(variables.places):
             if kind in ("index", "abbe") and row in place:
                 low[k] = high[k] = Glass.model[kind == "abbe"] / scale[k]
-        lens, (least, most) = (
-            with_glass(variables.lens, glass, place),
-            jnp.array([low, high], dtype),
-        )
+        least, most = jnp.array([low, high], dtype)
+        lens = with_glass(variables.lens, glass, place)
         own = dataclasses.replace(variables, lens=lens, low=least, high=most)
         return dataclasses.replace(problem, variables=own)
 

@@ -180,10 +180,8 @@ def optimise(
     start cannot be evaluated (no ray of a field passes, or a number is not finite), for a limit
     that the start violates and that no variable changes, and inside of `jax.jit`.
     """
-    outside = concrete((problem, vector))
-    require(
-        outside, "optimise: call it outside of jax.jit; inside, use least_squares.init and step"
-    )
+    what = "optimise: call it outside of jax.jit; inside, use least_squares.init and step"
+    require(concrete((problem, vector)), what)
     start = problem.variables.start if vector is None else jnp.asarray(vector)
     tried, history = problem.with_solver(solve_aimed), list[list[Array]]()
     search = init_problem(tried, jnp.clip(start, problem.variables.low, problem.variables.high))
@@ -202,11 +200,9 @@ def optimise(
         ended = bool(search.done) or float(search.score) <= target_merit
         if ended and len(history) > 1:
             break
-    require(
-        jnp.isfinite(search.evaluation.overlap),
-        "optimise: the start cannot be evaluated: no ray of a field passes, or a number is not "
-        "finite; begin with weaker curvatures or a smaller stop",
-    )
+    what = "optimise: the start cannot be evaluated: no ray of a field passes, or a number is not"
+    remedy = "begin with weaker curvatures or a smaller stop"
+    require(jnp.isfinite(search.evaluation.overlap), f"{what} finite; {remedy}")
     why = _why(tried, search, target_merit)
     if why != "target" and 0 < float(search.max_violation) <= _NEAR:
         search = _mended(tried, search)

@@ -152,11 +152,9 @@ class Problem:
             whole = operand.vignetting or not isinstance(rule, Clipped)
             remedy = "Clipped traces only what passes; take Gauss or Soft"
             require(whole, f"{what}: vignetting: {remedy}")
-            require(
-                not kind_of(operand.kind).of_waves or degree_of(rule) >= 2,
-                f"{what}: rule: needs Gauss or Soft of the order 2 or more, or Clipped of the "
-                f"order 3 or more; got {shown(rule)}",
-            )
+            fits = not kind_of(operand.kind).of_waves or degree_of(rule) >= 2
+            needs = "needs Gauss or Soft of the order 2 or more, or Clipped of the order 3 or more"
+            require(fits, f"{what}: rule: {needs}; got {shown(rule)}")
         weighs = any(operand.weight for operand in self.operands)
         require(weighs, "operands: all have the weight 0; a merit needs at least one")
 
