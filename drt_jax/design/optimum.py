@@ -114,21 +114,6 @@ def _again(search: Search) -> Search:
     return search._replace(stale=jnp.bool_(True), done=jnp.bool_(False))
 
 
-def _with_full_search(
-    problem: AnyProblem, tried: AnyProblem, search: Search
-) -> tuple[AnyProblem, Search]:
-    """The problem and the search to continue with.
-
-    `tried` is the problem whose rays are only aimed. If the full ray search of `problem` finds more
-    rays at the best vector, the search continues with `problem`, and the vector is evaluated again;
-    otherwise with `tried`.
-    """
-    failed = int(search.evaluation.failed)
-    if tried.solver is problem.solver or not failed or int(problem.failed(search.vector)) == failed:
-        return tried, search
-    return problem, take_step(problem, _again(search))
-
-
 def _mended(problem: AnyProblem, search: Search) -> Search:
     """Continues a search with stiff constraints until all limits are met.
 
@@ -195,8 +180,12 @@ def optimise(
         before = history[-1][2] if history else 0
         history.append([search.merit, search.max_violation, search.jacobians])
         callback(search)
-        if search.jacobians > before:  # a better lens
-            tried, search = _with_full_search(problem, tried, search)
+        # The rays of `tried` are only aimed. If the full ray search finds more of those of a better
+        # lens, the search continues with it, and evaluates the vector again.
+        lost, only_aimed = int(search.evaluation.failed), tried.solver is not problem.solver
+        searches = search.jacobians > before and lost and only_aimed
+        if searches and int(problem.failed(search.vector)) != lost:
+            tried, search = problem, take_step(problem, _again(search))
         ended = bool(search.done) or float(search.score) <= target_merit
         if ended and len(history) > 1:
             break

@@ -59,11 +59,10 @@ def _write(record: Record, found: list[Words], row: Words) -> None:
     """Write the number of a row over the one that is read."""
     key, where, value = row.key, row.count(), row.values[2]
     row.number(2)  # LensError for what is no number
-    first = next((k for k, words in enumerate(found) if words.key == "SURF"), 0)
-    head = found[:first]
+    starts = [k for k, words in enumerate(found) if words.key == "SURF"]
+    head = found[: min(starts, default=0)]
     what = f"{key} {where}: the file has none"
     if key in _SURFACE:
-        starts = [k for k, words in enumerate(found) if words.key == "SURF"]
         row.require(0 <= where < len(starts), what)
         start, end = starts[where], [*starts, len(found)][where + 1]
         name = _SURFACE[key]

@@ -173,10 +173,8 @@ class Scene:
     def flat(self) -> tuple[Array, Array]:
         """Field (P, 2) and distance (P,) of all points; of known numbers as NumPy arrays."""
         there = np if concrete((self.field, self.distance)) else jnp
-        return (
-            there.broadcast_to(self.field, (*self.shape, 2)).reshape(-1, 2),
-            there.broadcast_to(self.distance, self.shape).reshape(-1),
-        )
+        fields = there.broadcast_to(self.field, (*self.shape, 2))
+        return fields.reshape(-1, 2), there.broadcast_to(self.distance, self.shape).reshape(-1)
 
     @property
     def possible(self) -> Array:
