@@ -206,11 +206,6 @@ def _lens_alone(get: Callable[[FirstOrder], Array]) -> OperandKind:
     return OperandKind(values, ("wavelengths",), traced=False)
 
 
-def _back_distance(lens: Lens, rays: FieldRays) -> Array:
-    """Distance from the last vertex to the sensor along the light, (), mm."""
-    return float(lens.senses[-1]) * back_distance(lens)
-
-
 def _distortion(lens: Lens, rays: FieldRays) -> Array:
     """(Real - paraxial image height) / paraxial image height, (V, W), see `outwards`."""
 
@@ -300,7 +295,9 @@ OPERANDS: dict[str, OperandKind] = {
     "magnification": _at_distances("magnification"),
     "total_track": OperandKind(lambda lens, rays: lens.sensor, (), traced=False),
     "length": OperandKind(lambda lens, rays: jnp.sum(lens.thickness), (), traced=False),
-    "back_distance": OperandKind(_back_distance, (), traced=False),
+    "back_distance": OperandKind(
+        lambda lens, rays: float(lens.senses[-1]) * back_distance(lens), (), traced=False
+    ),
     "distortion": OperandKind(_distortion, _RAYS),
     "lateral_colour": OperandKind(_lateral_colour, _RAYS, order=("xy", *_VIEWS, "later")),
     "chief_ray_angle": OperandKind(

@@ -4,7 +4,6 @@ and obscurations.
 
 import dataclasses
 import itertools
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -72,13 +71,6 @@ class Apertures:
             else:
                 rows.append(self.half[k, np.array([0, int(kind != "circle")])])
         return jnp.stack(rows)
-
-    def only(self, keep: list[int]) -> "Apertures":
-        """A selection of the apertures. keep: their numbers."""
-        names, rows = ("surfaces", "kinds", "blocks", "pieces"), np.array(keep)
-        static: dict[str, Any] = {n: tuple(getattr(self, n)[k] for k in keep) for n in names}
-        centre, corners = (a if a is None else a[rows] for a in (self.centre, self.corners))
-        return Apertures(self.half[rows], centre, corners, **static)
 
     def outline(self, k: int) -> Array:
         """The corners (N, 2) of polygon k from its centre, mm."""

@@ -15,7 +15,6 @@ from ..numerics import Numbers, concrete, real_array
 from .forms import FORMS
 from .lens import Labels, Lens
 from .paraxial import entrance_pupil
-from .phase import Phase
 
 # How the named coefficients of forms change: the power of the size with which they scale, and their
 # sign if the sag changes sign.
@@ -83,6 +82,18 @@ def scaled(lens: Lens, factor: Numbers) -> Lens:
     )
 
 
+def only(part: Any, keep: Sequence[int]) -> Any:
+    """A selection of the phases, elements or apertures of a lens; None for an empty one.
+
+    part: a record whose arrays and static tuples have a row for each.
+    keep: numbers of the rows, in their new order.
+    """
+    names = [field.name for field in dataclasses.fields(part) if field.metadata]
+    static = {name: tuple(getattr(part, name)[k] for k in keep) for name in names}
+    arrays = jax.tree.map(lambda a: a[np.array(keep, int)], part)
+    return dataclasses.replace(arrays, **static) if keep else None
+
+
 def reindexed(lens: Lens, rows: Sequence[int], media: Sequence[int], thickness: Array) -> Lens:
     """The lens with its surfaces in another order, with planes added, or with fewer surfaces.
 
@@ -115,13 +126,10 @@ def reindexed(lens: Lens, rows: Sequence[int], media: Sequence[int], thickness: 
     replace = dataclasses.replace
     if phase is not None:
         ruled = phase.surfaces
-        order = sorted(stay(ruled), key=lambda k: new[ruled[k]])
-        rows_of_phase, surfaces = np.array(order, int), numbers(ruled[k] for k in order)
-        own = phase.coefficients[rows_of_phase], phase.order[rows_of_phase]
-        phase = Phase(*own, surfaces, tuple(phase.forms[k] for k in order)) if order else None
+        phase = only(phase, sorted(stay(ruled), key=lambda k: new[ruled[k]]))
+        phase = phase and replace(phase, surfaces=numbers(phase.surfaces))
     if apertures is not None:
-        left = stay(apertures.surfaces)
-        apertures = apertures.only(left) if left else None
+        apertures = only(apertures, stay(apertures.surfaces))
         apertures = apertures and replace(apertures, surfaces=numbers(apertures.surfaces))
     if elements is not None:
         spans = tuple((new[first], new[last]) for first, last in elements.spans)

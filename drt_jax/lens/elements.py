@@ -4,7 +4,6 @@ import dataclasses
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax import Array
 
 from ..numerics import matmul
@@ -33,12 +32,6 @@ class Elements:
     pivot: Array
     spans: tuple[tuple[int, int], ...] = dataclasses.field(metadata={"static": True})
     about: tuple[int, ...] = dataclasses.field(metadata={"static": True})
-
-    def only(self, keep: list[int]) -> "Elements":
-        """A selection of the groups. keep: their numbers."""
-        shift, tilt, pivot = (a[np.array(keep)] for a in (self.shift, self.tilt, self.pivot))
-        spans, about = tuple(self.spans[g] for g in keep), tuple(self.about[g] for g in keep)
-        return Elements(shift, tilt, pivot, spans, about)
 
     def carry(self, axis: Array, point: Array, rotation: Array) -> tuple[Array, Array]:
         """Moves surfaces with their groups, the inner groups first.
