@@ -35,7 +35,6 @@ from .perturbed import PerturbedLens, Tolerance
 from .problem import Problem, trace_fields
 from .values import OPERANDS, kind_of
 
-_COUNTED = ("fields", "wavelengths", "distances")
 _STEPS = 5  # of Gauss and Newton: an evaluation, and four trials
 
 
@@ -104,10 +103,9 @@ class Assembly:
         operands: dict[str, Any] = {}
         for one, lens in zip(problems, lenses):
             check(one, lens, kind)
-            counts = {name: len(getattr(one, name)) for name in _COUNTED}
             for name in ("criterion", "merit"):
                 operand = _operand(getattr(self, name))
-                operand.check(lens, counts)
+                operand.check(lens, one.counts)
                 operands[name] = operand.placed(lens)
         return dataclasses.replace(self, compensator=kind, parts=parts, **operands)
 

@@ -152,8 +152,7 @@ class Configurations:
         """
         problems = list(problems)
         known = problems and all(isinstance(problem, Problem) for problem in problems)
-        what = "problems: expected Problem.from_variables(...), one for each configuration"
-        require(known, what)
+        require(known, "problems: expected Problem.from_variables(...), one for each configuration")
         index, slots = _slots(problems, own)
         problems = _shared(problems, index, len(slots))
         arrays = np.empty((4, len(slots)))

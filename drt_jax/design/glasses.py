@@ -181,15 +181,6 @@ def _neighbours(
     require(known, f"snap_glasses: no glass fits behind surface {place[0]}; {remedy}")
 
 
-def _snap(trial: _Trial, found: Optimum, max_steps: int) -> tuple[Snap, Optimum]:
-    """Puts the glass of a trial into an optimum, and optimises the remaining variables."""
-    after = optimise(trial.problem, jnp.asarray(trial.vector), max_steps)
-    row = trial.place[0] + 1
-    nd, vd = np.asarray(nd_and_vd(found.lens.dispersion))[row].tolist()
-    names = trial.near.glass.name, found.lens.glasses[row]
-    return Snap(trial.place, *names, (nd, vd), found.score, after.score), after
-
-
 def snap_glasses(
     problem: AnyProblem,
     found: Optimum,
@@ -248,7 +239,11 @@ def snap_glasses(
         tried = ranked[:1] if left else [t for t in ranked if t.score < most][:_EXCHANGES]
         done = True
         for trial in tried:
-            snap, after = _snap(trial, found, max_steps)
+            after = optimise(trial.problem, jnp.asarray(trial.vector), max_steps)
+            row = trial.place[0] + 1
+            nd, vd = np.asarray(nd_and_vd(found.lens.dispersion))[row].tolist()
+            both = trial.near.glass.name, names[row]
+            snap = Snap(trial.place, *both, (nd, vd), found.score, after.score)
             if left or snap.after < (1 - _GAIN) * snap.before:
                 problem, found, done = trial.problem, after, False
                 left = [place for place in left if place != trial.place]

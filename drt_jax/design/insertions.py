@@ -71,8 +71,7 @@ def insertions(
     for i, front, own in places:
         gap = float(abs(lens.thickness[i - 1])) if front and i else 0.0
         behind, far = (i - 1, gap - 2 * thickness) if gap else (i - front, thickness)
-        new = own if glass is None else glass
-        start = inserted(lens, behind, new, i, far, thickness)
+        start = inserted(lens, behind, own if glass is None else glass, i, far, thickness)
         problem = problem_of(start)
         middle = behind + (2 if front else 1)
         for way in (1, -1):

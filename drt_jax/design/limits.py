@@ -88,8 +88,7 @@ def refuse_fixed(
     for limit, is_fixed in zip(limits(excess) if fixed.any() else [], fixed):
         of_rays = limit.kind not in OPERANDS or "fields" in OPERANDS[limit.kind].names
         remedy = "leave this limit out, widen it, or vary what it depends on"
-        what = f"operands: {limit}, and no variable moves it; {remedy}"
-        require(of_rays or not is_fixed, what)
+        require(of_rays or not is_fixed, f"operands: {limit}, and no variable moves it; {remedy}")
 
 
 def _names(operand: Operand, lens: Lens, counts: dict[str, int], size: int) -> list[str]:

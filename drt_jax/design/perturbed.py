@@ -190,8 +190,7 @@ def _deviations_of(lens: Lens, tolerance: Tolerance, configurations: int) -> lis
     some = ", ".join(map(str, possible))
     for place in tolerance.which:
         require(place in possible, f"{what}: no {kind.whole} {place} can deviate; there are {some}")
-    apart = tolerance.own and configurations > 1
-    each = range(configurations) if apart else [None]
+    each = range(configurations) if tolerance.own and configurations > 1 else [None]
     places = itertools.product(each, tolerance.which or possible, range(kind.axes))
     return [Deviation(tolerance.kind, place, axis, only) for only, place, axis in places]
 

@@ -80,8 +80,7 @@ class Vary:
         require_one_of("variables: kind", self.kind, PARTS)
         what = f"variables: {self.kind}"
         for name in ("surfaces", "terms"):
-            numbers = whole_numbers(f"{what}: {name}", getattr(self, name))
-            object.__setattr__(self, name, numbers)
+            object.__setattr__(self, name, whole_numbers(f"{what}: {name}", getattr(self, name)))
         order = f"low {self.low:g} is not below high {self.high:g}; exchange them"
         require(self.low < self.high, f"{what}: {order}")
         size = f"scale: must be above 0, or 0 to have it chosen, got {self.scale:g}"

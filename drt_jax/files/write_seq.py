@@ -109,8 +109,7 @@ def _lines(system: System) -> list[str]:
     places = _places(lens)
     for i in range(lens.count):
         word = "REFL" if lens.mirrors[i] else words[i + 1]
-        numbers = f"{float(lens.curvature[i])!r} {gap_behind(lens, i)!r}"
-        lines.append(f"S {numbers} {word}".rstrip())
+        lines.append(f"S {float(lens.curvature[i])!r} {gap_behind(lens, i)!r} {word}".rstrip())
         lines += [f"  {line}" for line in _surface(i, entry_of(lens, i, {})) + places[i]]
     lines.append(f"SI {float(lens.curvature[-1])!r} 0.0")
     conic = float(lens.conic[-1])

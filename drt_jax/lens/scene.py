@@ -68,8 +68,7 @@ class Scene:
         shape, far = angles.shape, np.shape(known_array("distance", distance))
         require(shape in ((), (2,)), f"field: expected one angle or two, got shape {shape}")
         require(len(far) < 2, f"distance: expected one number or (Z,), got shape {far}")
-        pair = angles if angles.ndim else _pairs(angles)
-        return cls._made(pair, distance, wavelengths, weights)
+        return cls._made(angles if angles.ndim else _pairs(angles), distance, wavelengths, weights)
 
     @classmethod
     def radians(
