@@ -82,6 +82,18 @@ def batched(function: Callable, axes: int) -> Callable:
     return function
 
 
+def selected(part: Any, keep: Sequence[int]) -> Any:
+    """A selection of the rows of a record, such as the elements of a lens; None for an empty one.
+
+    part: a dataclass whose arrays and static tuples have as many rows.
+    keep: numbers of the rows, in their new order.
+    """
+    names = [field.name for field in dataclasses.fields(part) if field.metadata]
+    static = {name: tuple(getattr(part, name)[k] for k in keep) for name in names}
+    arrays = jax.tree.map(lambda a: a[np.array(keep, int)], part)
+    return dataclasses.replace(arrays, **static) if keep else None
+
+
 def concrete(tree: Any) -> bool:
     """Whether no leaf of `tree` is a tracer of `jit`, `vmap` or a derivative: all numbers are
     known.

@@ -13,7 +13,6 @@ import numpy as np
 from jax import Array
 
 from ..inputs import nearest, parse, read_text, require_one_of, shown
-from ..lens.edit import only
 from ..lens.lens import Lens
 from ..lens.paraxial import FirstOrder, entrance_pupil, first_order, image_height
 from ..lens.scene import Scene, field_of_height
@@ -348,7 +347,7 @@ def _without_rim(lens: Lens) -> Lens:
         return lens
     lies = [*zip(own.surfaces, own.kinds, own.blocks, strict=True)]
     keep = [k for k, place in enumerate(lies) if place != rim or rim in lies[:k]]
-    return dataclasses.replace(lens, apertures=only(own, keep))
+    return dataclasses.replace(lens, apertures=own.only(keep))
 
 
 def _angles(record: Record, lens: Lens) -> np.ndarray | None:

@@ -11,7 +11,7 @@ import numpy as np
 from jax import Array
 
 from ..inputs import require
-from ..numerics import concrete, safe_divide, safe_sqrt
+from ..numerics import concrete, safe_divide, safe_sqrt, selected
 from .polygon import convex_pieces
 
 
@@ -46,6 +46,7 @@ class Apertures:
     pieces: tuple[tuple[tuple[int, ...], ...], ...] = dataclasses.field(
         metadata={"static": True}, kw_only=True, default=()
     )
+    only = selected
 
     def __post_init__(self) -> None:
         if not self.pieces and self.corners is None:

@@ -11,7 +11,7 @@ import numpy as np
 from jax import Array
 
 from ..inputs import require
-from ..numerics import Numbers, concrete, real_array
+from ..numerics import Numbers, concrete, real_array, selected
 from .forms import FORMS
 from .lens import Labels, Lens
 from .paraxial import entrance_pupil
@@ -82,18 +82,6 @@ def scaled(lens: Lens, factor: Numbers) -> Lens:
     )
 
 
-def only(part: Any, keep: Sequence[int]) -> Any:
-    """A selection of the phases, elements or apertures of a lens; None for an empty one.
-
-    part: a record whose arrays and static tuples have a row for each.
-    keep: numbers of the rows, in their new order.
-    """
-    names = [field.name for field in dataclasses.fields(part) if field.metadata]
-    static = {name: tuple(getattr(part, name)[k] for k in keep) for name in names}
-    arrays = jax.tree.map(lambda a: a[np.array(keep, int)], part)
-    return dataclasses.replace(arrays, **static) if keep else None
-
-
 def reindexed(lens: Lens, rows: Sequence[int], media: Sequence[int], thickness: Array) -> Lens:
     """The lens with its surfaces in another order, with planes added, or with fewer surfaces.
 
@@ -126,10 +114,10 @@ def reindexed(lens: Lens, rows: Sequence[int], media: Sequence[int], thickness: 
     replace = dataclasses.replace
     if phase is not None:
         ruled = phase.surfaces
-        phase = only(phase, sorted(stay(ruled), key=lambda k: new[ruled[k]]))
+        phase = selected(phase, sorted(stay(ruled), key=lambda k: new[ruled[k]]))
         phase = phase and replace(phase, surfaces=numbers(phase.surfaces))
     if apertures is not None:
-        apertures = only(apertures, stay(apertures.surfaces))
+        apertures = apertures.only(stay(apertures.surfaces))
         apertures = apertures and replace(apertures, surfaces=numbers(apertures.surfaces))
     if elements is not None:
         spans = tuple((new[first], new[last]) for first, last in elements.spans)

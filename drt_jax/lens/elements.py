@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from ..numerics import matmul
+from ..numerics import matmul, selected
 
 
 @jax.tree_util.register_dataclass
@@ -32,6 +32,7 @@ class Elements:
     pivot: Array
     spans: tuple[tuple[int, int], ...] = dataclasses.field(metadata={"static": True})
     about: tuple[int, ...] = dataclasses.field(metadata={"static": True})
+    only = selected
 
     def carry(self, axis: Array, point: Array, rotation: Array) -> tuple[Array, Array]:
         """Moves surfaces with their groups, the inner groups first.

@@ -11,7 +11,7 @@ from jax import Array
 
 from ..inputs import require, require_one_of
 from ..numerics import Numbers, concrete, real_array
-from .edit import only, reindexed
+from .edit import reindexed
 from .glass import with_media
 from .lens import Labels, Lens
 
@@ -66,9 +66,9 @@ def joined(first: Lens, second: Lens, gap: Numbers, stop: str = "first") -> Lens
     require(not concrete(space) or space > 0, f"gap: expected mm above 0, got {gap}")
     elements, apertures = first.elements, first.apertures
     if apertures is not None:
-        apertures = only(apertures, [k for k, i in enumerate(apertures.surfaces) if i < count])
+        apertures = apertures.only([k for k, i in enumerate(apertures.surfaces) if i < count])
     if elements is not None:
-        elements = only(elements, [g for g, span in enumerate(elements.spans) if span[0] < count])
+        elements = elements.only([g for g, span in enumerate(elements.spans) if span[0] < count])
         about = () if elements is None else elements.about
         require(count not in about, "first: an element turns about its sensor")
     first = dataclasses.replace(first, elements=elements, apertures=apertures)
