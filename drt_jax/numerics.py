@@ -38,6 +38,11 @@ else:
         """
 
 
+def array(values: object) -> Array:
+    """Numbers as an array of the default floating dtype, made without any compilation."""
+    return jax.device_put(np.asarray(values, jnp.result_type(float)))
+
+
 def safe_sqrt(x: Array) -> Array:
     """Square root of `x`; 0, with derivative 0, where `x` <= 0.
 
@@ -75,6 +80,18 @@ def batched(function: Callable, axes: int) -> Callable:
     for _ in range(axes):
         function = jax.vmap(function)
     return function
+
+
+def selected(part: Any, keep: Sequence[int]) -> Any:
+    """A selection of the rows of a record, such as the elements of a lens; None for an empty one.
+
+    part: a dataclass whose arrays and static tuples have as many rows.
+    keep: numbers of the rows, in their new order.
+    """
+    names = [field.name for field in dataclasses.fields(part) if field.metadata]
+    static = {name: tuple(getattr(part, name)[k] for k in keep) for name in names}
+    arrays = jax.tree.map(lambda a: a[np.array(keep, int)], part)
+    return dataclasses.replace(arrays, **static) if keep else None
 
 
 def concrete(tree: Any) -> bool:

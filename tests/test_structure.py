@@ -49,13 +49,13 @@ ALLOWED_ALL = {"learn.__init__", *(f"show.{name}" for name in _DRAWN)}
 # Most lines of code of each room; no blank, comment, docstring or import is counted. They
 # fall, and rise only by a new capability, whose commit says by how much: text is free, code is not.
 ROOMS = {
-    "drt_jax": 368,
+    "drt_jax": 375,
     "drt_jax/check": 329,
-    "drt_jax/design": 3294,
-    "drt_jax/files": 3128,
+    "drt_jax/design": 3179,
+    "drt_jax/files": 3114,
     "drt_jax/image": 3012,
     "drt_jax/learn": 655,
-    "drt_jax/lens": 1886,
+    "drt_jax/lens": 1850,
     "drt_jax/pupil": 774,
     "drt_jax/rays": 1320,
     "drt_jax/show": 1463,

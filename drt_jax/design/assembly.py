@@ -35,7 +35,6 @@ from .perturbed import PerturbedLens, Tolerance
 from .problem import Problem, trace_fields
 from .values import OPERANDS, kind_of
 
-_COUNTED = ("fields", "wavelengths", "distances")
 _STEPS = 5  # of Gauss and Newton: an evaluation, and four trials
 
 
@@ -75,10 +74,7 @@ class Assembly:
         return given if isinstance(given, Assembly) else cls(given)
 
     def placed(
-        self,
-        problem: AnyProblem,
-        lenses: Sequence[Lens],
-        beam_radius: Array | None = None,
+        self, problem: AnyProblem, lenses: Sequence[Lens], beam_radius: Array | None = None
     ) -> "Assembly":
         """The assembly of a lens, with arrays in place of numbers.
 
@@ -90,11 +86,9 @@ class Assembly:
         rule with more symmetry than the lens; and for other counts of lenses and configurations.
         """
         problems, own = problems_of(problem), len(lenses)
-        require(
-            own == len(problems),
-            f"problem: has {len(problems)} configurations, the lens {own}; give "
-            "Configurations.from_problems([...]), and PerturbedLens.from_lens of as many lenses",
-        )
+        what = f"problem: has {len(problems)} configurations, the lens {own}; give Configurations"
+        remedy = "from_problems([...]), and PerturbedLens.from_lens of as many lenses"
+        require(own == len(problems), f"{what}.{remedy}")
         kind: Any = self.compensator
         parts: Any = self.parts
         if parts is None and not isinstance(kind, str):
@@ -109,10 +103,9 @@ class Assembly:
         operands: dict[str, Any] = {}
         for one, lens in zip(problems, lenses):
             check(one, lens, kind)
-            counts = {name: len(getattr(one, name)) for name in _COUNTED}
             for name in ("criterion", "merit"):
                 operand = _operand(getattr(self, name))
-                operand.check(lens, counts)
+                operand.check(lens, one.counts)
                 operands[name] = operand.placed(lens)
         return dataclasses.replace(self, compensator=kind, parts=parts, **operands)
 
@@ -188,9 +181,8 @@ class Assembly:
             return self.pull(lens, rays), jnp.sum(~rays.arrives, dtype=jnp.int32)
 
         def evaluate(part: Array) -> least_squares.Evaluation:
-            residuals, failed = zip(
-                *over(problem, pulls, self.adjusted(lenses, part * parts.sizes)), strict=True
-            )
+            each = over(problem, pulls, self.adjusted(lenses, part * parts.sizes))
+            residuals, failed = zip(*each, strict=True)
             scaled = [root * own for root, own in zip(roots, residuals, strict=True)]
             lost = sum(failed[1:], failed[0])
             # A step that loses rays is not taken, see `least_squares.step`.
@@ -209,9 +201,8 @@ class Assembly:
         self, problem: AnyProblem, lenses: Sequence[Lens], rays: Sequence[FieldRays]
     ) -> Array:
         """The best adjustments (C,) of the sensor, by the rays of each configuration."""
-        equations = [
-            normal_equations(lens, own, self.sensor) for lens, own in zip(lenses, rays, strict=True)
-        ]
+        pairs = zip(lenses, rays, strict=True)
+        equations = [normal_equations(lens, own, self.sensor) for lens, own in pairs]
         if self.sensor != "common focus":
             return jnp.concatenate([solved(*own) for own in equations])
         matrices, rights = zip(*equations, strict=True)

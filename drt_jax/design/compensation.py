@@ -113,15 +113,11 @@ def check(problem: Problem, lens: Lens, compensator: str) -> None:
     """Raises the ValueErrors of `Assembly.placed` that concern the sensor and the pupil rule."""
     require_one_of("compensator", compensator, get_args(Compensator))
     has, needs = problem.rule.symmetry, symmetry_by_structure(lens, axial=True)
-    require(
-        _SYMMETRIES.index(has) >= _SYMMETRIES.index(needs),
-        f'rule: "{has}" leaves out part of the pupil, but deviations break the symmetry; use one '
-        f'of symmetry "{needs}", such as Gauss(6, "{needs}")',
-    )
+    what = f'rule: "{has}" leaves out part of the pupil, but deviations break the symmetry'
+    remedy = f'use one of symmetry "{needs}", such as Gauss(6, "{needs}")'
+    require(_SYMMETRIES.index(has) >= _SYMMETRIES.index(needs), f"{what}; {remedy}")
     if compensator == "focus and tilt" and concrete(problem.fields):
         tangents = np.tan(np.asarray(problem.fields, float))
-        require(
-            np.linalg.matrix_rank(np.c_[np.ones(len(tangents)), tangents]) == 3,
-            "compensator: focus and tilt: the fields lie on a line, so that the tilt about this "
-            "line is undetermined; add a field off the line",
-        )
+        spread = np.linalg.matrix_rank(np.c_[np.ones(len(tangents)), tangents]) == 3
+        what = "compensator: focus and tilt: the fields lie on a line, so that the tilt about this"
+        require(spread, f"{what} line is undetermined; add a field off the line")

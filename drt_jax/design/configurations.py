@@ -97,7 +97,8 @@ class _Alike:
         """Problems by number, with the leaves that differ between them stacked."""
         first, *_ = problems.values()
         rows = list(zip(*map(jax.tree.leaves, problems.values()), strict=True))
-        differ = tuple(k for k, row in enumerate(rows) if not all(_same(row[0], a) for a in row))
+        alike = (all(a is row[0] or np.array_equal(a, row[0]) for a in row) for row in rows)
+        differ = tuple(k for k, same in enumerate(alike) if not same)
         own = tuple(jnp.stack(rows[k]) for k in differ)
         places = jnp.stack([jnp.asarray(index[number]) for number in problems])
         return cls(first, own, places, differ, tuple(problems))
@@ -115,11 +116,6 @@ class _Alike:
             (number, self.one([a[k] for a in self.own]), self.index[k])
             for k, number in enumerate(self.numbers)
         ]
-
-
-def _same(one: Any, other: Any) -> bool:
-    """True for equal arrays."""
-    return one is other or np.array_equal(np.asarray(one), np.asarray(other))
 
 
 @jax.tree_util.register_dataclass
@@ -156,10 +152,8 @@ class Configurations:
         that contradict each other, and for a solve of a curvature, which cannot hold in all.
         """
         problems = list(problems)
-        require(
-            problems and all(isinstance(problem, Problem) for problem in problems),
-            "problems: expected Problem.from_variables(...), one for each configuration",
-        )
+        known = problems and all(isinstance(problem, Problem) for problem in problems)
+        require(known, "problems: expected Problem.from_variables(...), one for each configuration")
         index, slots = _slots(problems, own)
         problems = _shared(problems, index, len(slots))
         arrays = np.empty((4, len(slots)))
@@ -230,15 +224,10 @@ class Configurations:
         """Residuals, constraints, overlap and number of failed rays, as `Problem.evaluate`."""
         each = self.evaluate_each(vector)
         roots = jnp.sqrt(self.weights)
-        residuals = [roots[k] * one.residuals for k, one in enumerate(each)]
-        constraints = [one.constraints for one in each]
+        residuals = jnp.concatenate([roots[k] * one.residuals for k, one in enumerate(each)])
+        constraints = jnp.concatenate([one.constraints for one in each])
         overlap, failed = sum(one.overlap for one in each), sum(one.failed for one in each)
-        return Evaluation(
-            jnp.concatenate(residuals),
-            jnp.concatenate(constraints),
-            jnp.asarray(overlap),
-            jnp.asarray(failed),
-        )
+        return Evaluation(residuals, constraints, jnp.asarray(overlap), jnp.asarray(failed))
 
     @jax.jit
     def merits(self, vector: Array) -> Array:
@@ -271,13 +260,9 @@ class Configurations:
 
     def with_solver(self, solver: Solver) -> "Configurations":
         """The same with another ray solver."""
-        return dataclasses.replace(
-            self,
-            groups=tuple(
-                dataclasses.replace(group, problem=group.problem.with_solver(solver))
-                for group in self.groups
-            ),
-        )
+        replace = dataclasses.replace
+        groups = (replace(own, problem=own.problem.with_solver(solver)) for own in self.groups)
+        return replace(self, groups=tuple(groups))
 
     def map(self, function: Callable[[Problem], Any]) -> "Configurations":
         """The same with other problems, such as `lambda p: p.with_order(8)`.
@@ -343,11 +328,9 @@ def _slots(
     shared = [place for place in sets[0] if not is_own(place)]
     for number, places in enumerate(sets):
         others: set[Place] = set(shared).symmetric_difference(p for p in places if not is_own(p))
-        require(
-            not others,
-            f"variables: configuration {number + 1} and 1 do not both vary "
-            f"{', '.join(sorted(map(str, others)))}; vary it in all, or name it in own",
-        )
+        some = ", ".join(sorted(map(str, others)))
+        what = f"variables: configuration {number + 1} and 1 do not both vary {some}"
+        require(not others, f"{what}; vary it in all, or name it in own")
     slots = {str(place): k for k, place in enumerate(shared)}
     index = []
     for number, places in enumerate(sets):
@@ -366,11 +349,9 @@ def _shared(problems: Sequence[Problem], index: Sequence[np.ndarray], count: int
     low, high = np.full(count, -np.inf), np.full(count, np.inf)
     for own, where in zip([p.variables for p in reversed(problems)], reversed(index)):
         for solve in own.solves:
-            require(
-                solve.focuses or solve.aperture,
-                f"solves: {solve.kind}: changes curvature {solve.surface}, which all "
-                "configurations share; take an operand with a target",
-            )
+            what = f"solves: {solve.kind}: changes curvature {solve.surface}, which all"
+            remedy = "configurations share; take an operand with a target"
+            require(solve.focuses or solve.aperture, f"{what} {remedy}")
         step = np.asarray(own.scale, float)
         scale[where], value[where] = step, step * np.asarray(own.start)
         low[where] = np.maximum(low[where], step * np.asarray(own.low))
@@ -381,11 +362,9 @@ def _shared(problems: Sequence[Problem], index: Sequence[np.ndarray], count: int
         begins = np.asarray(own.scale * own.start, float)
         off = np.abs(begins - value[where]) > _EQUAL * (scale[where] + np.abs(value[where]))
         for name, is_off, at, first in zip(own.names, off, begins, value[where]):
-            require(
-                not is_off,
-                f"variables: {name} is shared, but begins at {first:g} in configuration 1 and at "
-                f"{at:g} in {number + 1}; give it one number, or name it in own",
-            )
+            starts = f"at {first:g} in configuration 1 and at {at:g} in {number + 1}"
+            what = f"variables: {name} is shared, but begins {starts}"
+            require(not is_off, f"{what}; give it one number, or name it in own")
         for name, is_empty in zip(own.names, low[where] >= high[where]):
             require(not is_empty, f"variables: {name}: its bounds have no common range; widen one")
         steps = scale[where]

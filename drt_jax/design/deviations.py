@@ -2,8 +2,9 @@
 
 import dataclasses
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection
 from functools import partial
+from operator import attrgetter
 from typing import Any, Literal, NamedTuple
 
 import jax
@@ -62,7 +63,7 @@ class Kind(NamedTuple):
     whole: str
     axes: int
     unit: str
-    places: Callable[[Lens], Sequence[int]]
+    places: Callable[[Lens], Collection[int]]
     change: Callable[[Lens, Errors], Lens]
     most: float = math.inf
     why_none: str = "the lens has none"
@@ -165,27 +166,17 @@ def _moved(name: str, unit: float, lens: Lens, errors: Errors) -> Lens:
     return dataclasses.replace(lens, elements=dataclasses.replace(elements, **{name: array}))
 
 
-def _active(lens: Lens) -> Sequence[int]:
-    """The active surfaces."""
-    return lens.active
-
-
 def _bendable(lens: Lens) -> list[int]:
     """Active surfaces that may have another curvature along x than along y."""
     return [i for i in lens.active if lens.forms[i] in ("asphere", *_WITH_X)]
 
 
-def _pieces(lens: Lens) -> Sequence[int]:
-    """Surfaces in front of pieces of glass."""
-    return [*pieces_of(lens)]
-
-
-def _elements(lens: Lens) -> Sequence[int]:
+def _elements(lens: Lens) -> range:
     """The numbers of the elements."""
     return range(len(elements_of(lens)))
 
 
-_gaps = PARTS["thickness"].rows
+_active, _gaps = attrgetter("active"), PARTS["thickness"].rows
 _NOT_CURVED = "no surface is curved; for planes use fringes"
 _NOT_ROUND = "no surface is a sphere, conic, even asphere, biconic or toroid"
 _NO_GAP = "the lens has one surface, without a thickness behind it"
@@ -200,8 +191,8 @@ KINDS: dict[str, Kind] = {
     "thickness": Kind(
         "surface", 1, "mm", _gaps, partial(_with_part, "thickness", 1), why_none=_NO_GAP
     ),
-    "index": Kind("surface", 1, "", _pieces, partial(_with_glass, "index"), why_none=_NO_GLASS),
-    "abbe": Kind("surface", 1, "%", _pieces, partial(_with_glass, "abbe"), 100, _NO_GLASS),
+    "index": Kind("surface", 1, "", pieces_of, partial(_with_glass, "index"), why_none=_NO_GLASS),
+    "abbe": Kind("surface", 1, "%", pieces_of, partial(_with_glass, "abbe"), 100, _NO_GLASS),
     "decentre": Kind("element", 2, "mm", _elements, partial(_moved, "shift", 1)),
     "tilt": Kind("element", 2, "arc min", _elements, partial(_moved, "tilt", _MINUTE)),
     "sensor": Kind("sensor", 1, "mm", lambda lens: [0], partial(_with_part, "sensor", 1)),

@@ -11,6 +11,7 @@ from jax import Array
 
 from ..image.spot import deviations, normalised
 from ..image.spots import cones
+from ..inputs import require
 from ..lens.forms import FORMS
 from ..lens.lens import Lens
 from ..lens.scene import Scene, over_points
@@ -170,11 +171,9 @@ def trace_views(lens: Lens, views: FieldRays, solver: Solver) -> FieldRays:
     solver: a ray solver.
     """
     extra, rule = lens.apertures, views.rule
-    if extra is not None and any(extra.blocks) and isinstance(rule, Clipped):
-        raise ValueError(
-            "rule: Clipped gives negative weights for obscurations, which have no residuals; use "
-            "Gauss or Soft"
-        )
+    blocked = extra is not None and any(extra.blocks) and isinstance(rule, Clipped)
+    what = "rule: Clipped gives negative weights for obscurations, which have no residuals"
+    require(not blocked, f"{what}; use Gauss or Soft")
 
     def one(scene: Scene) -> tuple[Bundle, Vector, Array, Array, Array]:
         points, weights = _points(rule, lens, scene)

@@ -62,10 +62,6 @@ def focusing(
     known = jnp.isfinite(fields)
     tangents = jnp.abs(jnp.tan(jnp.where(known, fields, 0)) * shares)
     both = known & known[0] & (tangents[0] > 0)
-    breathing = tangents / jnp.where(both, tangents[0], 1) - 1
-    return Focusing(
-        jnp.where(known, jnp.arctan(tangents), jnp.inf),
-        jnp.where(both, breathing, jnp.inf),
-        magnifications,
-        lengths,
-    )
+    breathing = jnp.where(both, tangents / jnp.where(both, tangents[0], 1) - 1, jnp.inf)
+    angles = jnp.where(known, jnp.arctan(tangents), jnp.inf)
+    return Focusing(angles, breathing, magnifications, lengths)

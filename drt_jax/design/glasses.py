@@ -104,10 +104,8 @@ def _places(problem: Problem) -> list[tuple[int, ...]]:
     first = {row: row for row in model_glasses(variables.lens)}
     for (k, follower), line in zip(variables.ties, variables.lines.tolist(), strict=True):
         if follower.kind in ("index", "abbe"):
-            require(
-                line == [1, 0],
-                f"snap_glasses: {follower} is tied with a scale or shift; leave this tie out",
-            )
+            what = f"snap_glasses: {follower} is tied with a scale or shift; leave this tie out"
+            require(line == [1, 0], what)
             first[follower.row] = variables.places[k].row
     require(first, "snap_glasses: the lens has no model glass; see with_model_glass")
     return [tuple(r for r in first if first[r] == row) for row in sorted({*first.values()})]
@@ -145,10 +143,8 @@ def _with_glass(
         for k, (kind, row, _) in enumerate(variables.places):
             if kind in ("index", "abbe") and row in place:
                 low[k] = high[k] = Glass.model[kind == "abbe"] / scale[k]
-        lens, (least, most) = (
-            with_glass(variables.lens, glass, place),
-            jnp.array([low, high], dtype),
-        )
+        least, most = jnp.array([low, high], dtype)
+        lens = with_glass(variables.lens, glass, place)
         own = dataclasses.replace(variables, lens=lens, low=least, high=most)
         return dataclasses.replace(problem, variables=own)
 
@@ -183,15 +179,6 @@ def _neighbours(
             yield near
     remedy = "accept more than design.ordinary_glass, or name other makers"
     require(known, f"snap_glasses: no glass fits behind surface {place[0]}; {remedy}")
-
-
-def _snap(trial: _Trial, found: Optimum, max_steps: int) -> tuple[Snap, Optimum]:
-    """Puts the glass of a trial into an optimum, and optimises the remaining variables."""
-    after = optimise(trial.problem, jnp.asarray(trial.vector), max_steps)
-    row = trial.place[0] + 1
-    nd, vd = np.asarray(nd_and_vd(found.lens.dispersion))[row].tolist()
-    names = trial.near.glass.name, found.lens.glasses[row]
-    return Snap(trial.place, *names, (nd, vd), found.score, after.score), after
 
 
 def snap_glasses(
@@ -252,7 +239,11 @@ def snap_glasses(
         tried = ranked[:1] if left else [t for t in ranked if t.score < most][:_EXCHANGES]
         done = True
         for trial in tried:
-            snap, after = _snap(trial, found, max_steps)
+            after = optimise(trial.problem, jnp.asarray(trial.vector), max_steps)
+            row = trial.place[0] + 1
+            nd, vd = np.asarray(nd_and_vd(found.lens.dispersion))[row].tolist()
+            both = trial.near.glass.name, names[row]
+            snap = Snap(trial.place, *both, (nd, vd), found.score, after.score)
             if left or snap.after < (1 - _GAIN) * snap.before:
                 problem, found, done = trial.problem, after, False
                 left = [place for place in left if place != trial.place]

@@ -41,12 +41,8 @@ class Grade(NamedTuple):
 
 
 GRADES: dict[GradeName, Grade] = {
-    "commercial": Grade(
-        {"radius": 0.5, "thickness": 0.2, "index": 1e-3, "abbe": 0.8}, _GLASS
-    ),
-    "precision": Grade(
-        {"radius": 0.1, "thickness": 0.05, "index": 5e-4, "abbe": 0.5}, _GLASS
-    ),
+    "commercial": Grade({"radius": 0.5, "thickness": 0.2, "index": 1e-3, "abbe": 0.8}, _GLASS),
+    "precision": Grade({"radius": 0.1, "thickness": 0.05, "index": 5e-4, "abbe": 0.5}, _GLASS),
     # For this grade the chart uses the measured index of each melt, and gives no remaining error.
     "high precision": Grade({"radius": 0.01, "thickness": 0.01}, _GLASS),
     "moulded": Grade({"radius": 1.0, "thickness": 0.025, "irregularity": 6 * _RED}, _PLASTIC),
@@ -57,7 +53,7 @@ GRADES: dict[GradeName, Grade] = {
     "turned precision": Grade(
         {"radius": 0.1, "thickness": 0.005, "irregularity": 2 * _RED}, _PLASTIC
     ),
-}  # fmt: skip
+}
 
 
 def graded(lens: Lens, grade: GradeName) -> list[Tolerance]:

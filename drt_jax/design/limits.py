@@ -87,11 +87,8 @@ def refuse_fixed(
     fixed = (excess > 0) & np.isfinite(excess) & (steepest * _FAR < excess)
     for limit, is_fixed in zip(limits(excess) if fixed.any() else [], fixed):
         of_rays = limit.kind not in OPERANDS or "fields" in OPERANDS[limit.kind].names
-        require(
-            of_rays or not is_fixed,
-            f"operands: {limit}, and no variable moves it; leave this limit out, widen it, or vary "
-            "what it depends on",
-        )
+        remedy = "leave this limit out, widen it, or vary what it depends on"
+        require(of_rays or not is_fixed, f"operands: {limit}, and no variable moves it; {remedy}")
 
 
 def _names(operand: Operand, lens: Lens, counts: dict[str, int], size: int) -> list[str]:

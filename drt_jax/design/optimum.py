@@ -114,21 +114,6 @@ def _again(search: Search) -> Search:
     return search._replace(stale=jnp.bool_(True), done=jnp.bool_(False))
 
 
-def _with_full_search(
-    problem: AnyProblem, tried: AnyProblem, search: Search
-) -> tuple[AnyProblem, Search]:
-    """The problem and the search to continue with.
-
-    `tried` is the problem whose rays are only aimed. If the full ray search of `problem` finds more
-    rays at the best vector, the search continues with `problem`, and the vector is evaluated again;
-    otherwise with `tried`.
-    """
-    failed = int(search.evaluation.failed)
-    if tried.solver is problem.solver or not failed or int(problem.failed(search.vector)) == failed:
-        return tried, search
-    return problem, take_step(problem, _again(search))
-
-
 def _mended(problem: AnyProblem, search: Search) -> Search:
     """Continues a search with stiff constraints until all limits are met.
 
@@ -180,10 +165,8 @@ def optimise(
     start cannot be evaluated (no ray of a field passes, or a number is not finite), for a limit
     that the start violates and that no variable changes, and inside of `jax.jit`.
     """
-    outside = concrete((problem, vector))
-    require(
-        outside, "optimise: call it outside of jax.jit; inside, use least_squares.init and step"
-    )
+    what = "optimise: call it outside of jax.jit; inside, use least_squares.init and step"
+    require(concrete((problem, vector)), what)
     start = problem.variables.start if vector is None else jnp.asarray(vector)
     tried, history = problem.with_solver(solve_aimed), list[list[Array]]()
     search = init_problem(tried, jnp.clip(start, problem.variables.low, problem.variables.high))
@@ -197,16 +180,18 @@ def optimise(
         before = history[-1][2] if history else 0
         history.append([search.merit, search.max_violation, search.jacobians])
         callback(search)
-        if search.jacobians > before:  # a better lens
-            tried, search = _with_full_search(problem, tried, search)
+        # The rays of `tried` are only aimed. If the full ray search finds more of those of a better
+        # lens, the search continues with it, and evaluates the vector again.
+        lost, only_aimed = int(search.evaluation.failed), tried.solver is not problem.solver
+        searches = search.jacobians > before and lost and only_aimed
+        if searches and int(problem.failed(search.vector)) != lost:
+            tried, search = problem, take_step(problem, _again(search))
         ended = bool(search.done) or float(search.score) <= target_merit
         if ended and len(history) > 1:
             break
-    require(
-        jnp.isfinite(search.evaluation.overlap),
-        "optimise: the start cannot be evaluated: no ray of a field passes, or a number is not "
-        "finite; begin with weaker curvatures or a smaller stop",
-    )
+    what = "optimise: the start cannot be evaluated: no ray of a field passes, or a number is not"
+    remedy = "begin with weaker curvatures or a smaller stop"
+    require(jnp.isfinite(search.evaluation.overlap), f"{what} finite; {remedy}")
     why = _why(tried, search, target_merit)
     if why != "target" and 0 < float(search.max_violation) <= _NEAR:
         search = _mended(tried, search)

@@ -104,9 +104,8 @@ def _glass(column: int) -> tuple[Callable, Callable]:
         begins = np.maximum.accumulate(np.where(names[1:] != names[:-1], rows, 0))
         model: Any = lens.dispersion.model
         model = model.at[1:, column].set(array[begins, 0])
-        return dataclasses.replace(
-            lens, dispersion=dataclasses.replace(lens.dispersion, model=model)
-        )
+        own = dataclasses.replace(lens.dispersion, model=model)
+        return dataclasses.replace(lens, dispersion=own)
 
     return read, write
 

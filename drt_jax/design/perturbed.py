@@ -119,21 +119,18 @@ class PerturbedLens:
         sizes: dict[Deviation, float] = {}
         for tolerance in tolerances:
             for deviation in _deviations_of(lens, tolerance, 1 + len(others)):
-                require(
-                    deviation not in sizes, f"tolerances: {deviation} is named twice; remove one"
-                )
+                what = f"tolerances: {deviation} is named twice; remove one"
+                require(deviation not in sizes, what)
                 sizes[deviation] = tolerance.size
         require(sizes, "tolerances: none; name at least one")
         spans, dtype = elements_of(lens), lens.curvature.dtype
         (lens, groups), *more = (_with_parts(one, spans, sizes) for one in (lens, *others))
         structure: Any = jax.tree.structure(lens)
         for number, (other, own) in enumerate(more, start=2):
-            alike = elements_of(other) == spans and own == groups
-            require(
-                alike and structure == jax.tree.structure(other),
-                f"lens: configuration {number} differs from 1 in more than numbers (surfaces, "
-                "elements, tilts that only one has); make them by `configured`",
-            )
+            same = structure == jax.tree.structure(other) and elements_of(other) == spans
+            what = f"lens: configuration {number} differs from 1 in more than numbers (surfaces,"
+            what = f"{what} elements, tilts that only one has); make them by `configured`"
+            require(same and own == groups, what)
         numbers = jnp.asarray(beam_radius, dtype), jnp.asarray([*sizes.values()], dtype)
         rest = tuple(other for other, _ in more)
         return cls(lens, *numbers, tuple(sizes), spans, groups, rest)
@@ -168,23 +165,20 @@ class PerturbedLens:
 
     def lenses_of(self, perturbation: Array) -> list[Lens]:
         """The lens of each configuration with a perturbation (P,), as `lens_of`."""
-        return [
-            self._disturbed(lens, number, perturbation * self.sizes)
-            for number, lens in enumerate(self.lenses)
-        ]
+        by = perturbation * self.sizes
+        return [self._disturbed(lens, number, by) for number, lens in enumerate(self.lenses)]
 
     def _disturbed(self, nominal: Lens, number: int, by: Array) -> Lens:
         """The nominal lens of a configuration with deviations (P,), in the units of `Tolerance`."""
         lens = nominal
-        for kind in dict.fromkeys(error.kind for error in self.deviations):
-            here = [error.configuration in (None, number) for error in self.deviations]
-            alike = [error.kind == kind for error in self.deviations]
-            own = np.flatnonzero(np.array(here) & np.array(alike))
-            if not len(own):
-                continue
+        kinds: dict[str, list[int]] = {}
+        for k, error in enumerate(self.deviations):
+            if error.configuration in (None, number):
+                kinds.setdefault(error.kind, []).append(k)
+        for kind, own in kinds.items():
             at, axis = np.array([self.deviations[k][1:3] for k in own]).T
             at = np.array(self.groups)[at] if KINDS[kind].whole == "element" else at
-            errors = Errors(nominal, self.beam_radius, at, axis, by[own])
+            errors = Errors(nominal, self.beam_radius, at, axis, by[np.array(own)])
             lens = KINDS[kind].change(lens, errors)
         return lens
 
@@ -197,8 +191,7 @@ def _deviations_of(lens: Lens, tolerance: Tolerance, configurations: int) -> lis
     some = ", ".join(map(str, possible))
     for place in tolerance.which:
         require(place in possible, f"{what}: no {kind.whole} {place} can deviate; there are {some}")
-    apart = tolerance.own and configurations > 1
-    each = range(configurations) if apart else [None]
+    each = range(configurations) if tolerance.own and configurations > 1 else [None]
     places = itertools.product(each, tolerance.which or possible, range(kind.axes))
     return [Deviation(tolerance.kind, place, axis, only) for only, place, axis in places]
 
@@ -227,11 +220,9 @@ def _with_elements(lens: Lens, spans: tuple[tuple[int, int], ...]) -> tuple[Lens
     new = [(span, span[0], zero, zero, zero[0]) for span in spans]
     kept = [] if old is None else [*zip(old.spans, old.about, old.shift, old.tilt, old.pivot)]
     for ((a, b), *_), (first, last) in itertools.product(kept, spans):
-        require(
-            not (a < first <= b < last or first < a <= last < b),
-            f"tolerances: the element of surfaces {first} to {last} is cut by that of the "
-            f"lens file, {a} to {b}; put one inside the other, or apart",
-        )
+        what = f"tolerances: the element of surfaces {first} to {last} is cut by that of the"
+        what = f"{what} lens file, {a} to {b}; put one inside the other, or apart"
+        require(not (a < first <= b < last or first < a <= last < b), what)
     # A group comes before the groups inside it.
     groups = sorted([*kept, *new], key=lambda group: (group[0][0], -group[0][1]))
     where, about, *arrays = zip(*groups)

@@ -145,26 +145,23 @@ class Problem:
         distances, rule = np.asarray(self.distances), self.rule
         for operand in self.operands:
             what = f"operands: {operand.name}"
-            operand.check(self.variables.lens, self._counts)
+            operand.check(self.variables.lens, self.counts)
             named = distances[np.array(operand.distances or range(len(distances)))]
             near = operand.kind != "magnification" or np.all(np.isfinite(named))
             require(near, f"{what}: the object is at infinity")
             whole = operand.vignetting or not isinstance(rule, Clipped)
             remedy = "Clipped traces only what passes; take Gauss or Soft"
             require(whole, f"{what}: vignetting: {remedy}")
-            require(
-                not kind_of(operand.kind).of_waves or degree_of(rule) >= 2,
-                f"{what}: rule: needs Gauss or Soft of the order 2 or more, or Clipped of the "
-                f"order 3 or more; got {shown(rule)}",
-            )
+            fits = not kind_of(operand.kind).of_waves or degree_of(rule) >= 2
+            needs = "needs Gauss or Soft of the order 2 or more, or Clipped of the order 3 or more"
+            require(fits, f"{what}: rule: {needs}; got {shown(rule)}")
         weighs = any(operand.weight for operand in self.operands)
         require(weighs, "operands: all have the weight 0; a merit needs at least one")
 
     @property
-    def _counts(self) -> dict[str, int]:
+    def counts(self) -> dict[str, int]:
         """Numbers of fields, wavelengths and distances."""
-        names = ("fields", "wavelengths", "distances")
-        return {name: len(getattr(self, name)) for name in names}
+        return {name: len(getattr(self, name)) for name in ("fields", "wavelengths", "distances")}
 
     def __str__(self) -> str:
         """About ten lines: variables, rays and operands."""
@@ -250,7 +247,7 @@ class Problem:
 
         constraints: (L,), constraints of an evaluation.
         """
-        counts = self._counts | {"xy": 2 if self.rule.symmetry == "none" else 1}
+        counts = self.counts | {"xy": 2 if self.rule.symmetry == "none" else 1}
         lens, sizes = self.variables.lens, [0] * len(self.operands)
         if any(callable(operand.kind) for operand in self.operands):
             each = jax.eval_shape(lambda lens: self._constraints(lens, self._rays(lens)), lens)

@@ -110,11 +110,8 @@ class Sensitivity(NamedTuple):
         rows = self.rows()
         widths = [max(map(len, column)) for column in zip(*rows)]
         first = f"{self.criterion}: {nominal} without errors; changes by {self.by}"
-        lines = (
-            "  ".join([row[0].ljust(widths[0]), *map(str.rjust, row[1:], widths[1:])])
-            for row in rows
-        )
-        return "\n".join([first, *lines])
+        cells = ([row[0].ljust(widths[0]), *map(str.rjust, row[1:], widths[1:])] for row in rows)
+        return "\n".join([first, *map("  ".join, cells)])
 
 
 def sensitivity(

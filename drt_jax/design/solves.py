@@ -105,11 +105,10 @@ class Solve:
         active = ", ".join(map(str, lens.active))
         what = f"solves: {self.kind}: its curvature follows: give surface, one of {active}"
         require(self.surface in lens.active, what)
-        require(
-            self.kind != "image_angle" or self.surface >= lens.stop,
-            f"solves: image_angle: surface {self.surface} lies before the stop, which is number "
-            f"{lens.stop}; give the stop or a surface behind it, of {active}",
-        )
+        what = f"{self.surface} lies before the stop, which is number {lens.stop}"
+        what = f"solves: image_angle: surface {what}; give the stop or a surface behind it"
+        behind = self.kind != "image_angle" or self.surface >= lens.stop
+        require(behind, f"{what}, of {active}")
         return Place("curvature", self.surface, 0)
 
     def with_value(self, value: Array | float) -> "Solve":
@@ -136,11 +135,9 @@ class Solve:
         """
         what, place = f"solves: {self.kind}", self.place(lens)
         if self.focuses:
-            require(
-                float(_focus(lens, self.placed(lens))[1]) > 0,
-                f"{what}: there is no focus: the light behind the lens is parallel, or absent; "
-                "leave it out, or start from another lens",
-            )
+            converges = float(_focus(lens, self.placed(lens))[1]) > 0
+            what = f"{what}: there is no focus: the light behind the lens is parallel, or absent"
+            require(converges, f"{what}; leave it out, or start from another lens")
             scene = Scene.point(0.0, self.distance, self.wavelengths)
             warn_of_focus(lens, checked_scene(lens, scene))
             return self
@@ -153,11 +150,9 @@ class Solve:
         target = self.converted(float(solve.value))
         ratio = float(_measure(solve.apply(lens), solve)) / target
         change = float(solve.rate(lens, solve)) * step_of(lens, place)
-        require(
-            abs(change) > _TOLERANCE * abs(target) and abs(ratio - 1) < _TOLERANCE,
-            f"{what}: no {place.kind} of surface {place.row} gives {solve.value:g}; is the beam in "
-            "focus there? give another surface",
-        )
+        meets = abs(change) > _TOLERANCE * abs(target) and abs(ratio - 1) < _TOLERANCE
+        what = f"{what}: no {place.kind} of surface {place.row} gives {solve.value:g}"
+        require(meets, f"{what}; is the beam in focus there? give another surface")
         return solve
 
     def converted(self, value: Any) -> Any:
@@ -190,11 +185,8 @@ def fix_solves(lens: Lens, solves: Sequence[Solve]) -> tuple[tuple[Solve, ...], 
     found: list[Solve] = []
     for solve in sorted(solves, key=lambda solve: get_args(_Name).index(solve.kind)):
         for other in found:
-            require(
-                float(other.rate(lens, solve)) == 0,
-                f"solves: {other.kind} and {solve.kind}: the second changes what the first keeps; "
-                "leave one out",
-            )
+            what = f"solves: {other.kind} and {solve.kind}: the second changes what the first keeps"
+            require(float(other.rate(lens, solve)) == 0, f"{what}; leave one out")
         found.append(solve.fixed(lens))
         lens = found[-1].apply(lens)
     return tuple(solve.placed(lens) for solve in found), lens
@@ -235,9 +227,8 @@ def _power(lens: Lens, solve: Solve) -> Array:
 def _slope(lens: Lens, solve: Solve) -> Array:
     """Paraxial slope of the marginal ray behind the lens; mean over wavelengths."""
     vergence = vergence_of(jnp.asarray(solve.distance, lens.curvature.dtype))
-    return jnp.mean(
-        marginal_ray(paraxial_system(lens, _wavelengths(lens, solve)), vergence).behind[-1]
-    )
+    system = paraxial_system(lens, _wavelengths(lens, solve))
+    return jnp.mean(marginal_ray(system, vergence).behind[-1])
 
 
 def _pupil(lens: Lens, solve: Solve) -> Array:
@@ -275,9 +266,8 @@ def _focus(lens: Lens, solve: Solve) -> tuple[Array, Array]:
         return back + solve.value, jnp.min(jnp.abs(ray.behind[-1]))
     spreads = []
     for field in solve.fields:
-        scene = checked_scene(
-            lens, Scene.point(0.0 if field is None else field, solve.distance, waves)
-        )
+        point = Scene.point(0.0 if field is None else field, solve.distance, waves)
+        scene = checked_scene(lens, point)
         rule = Gauss(_ORDER, symmetry_by_structure(lens, field is None))
         spread = moments(lens, scene, rule, solve_aimed).spread
         spreads.append(jnp.mean(jnp.sum(spread[..., :2], axis=-1), axis=-1))

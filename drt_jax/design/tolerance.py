@@ -142,12 +142,7 @@ def _many(
     mesh: Mesh | None,
 ) -> AsBuilt:
     """The lenses of one tile, shared among the devices of a mesh."""
-
-    def one(
-        problem: AnyProblem, perturbed: PerturbedLens, assembly: Assembly, row: Array
-    ) -> AsBuilt:
-        return assembly.built(problem, perturbed.lenses_of(row))
-
+    one = lambda problem, lens, assembly, row: assembly.built(problem, lens.lenses_of(row))  # noqa: E731
     many = shared(jax.vmap(one, (None, None, None, 0)), mesh, 3)
     return many(problem, perturbed, assembly, perturbation)
 
@@ -237,11 +232,8 @@ class Predicted(NamedTuple):
         perturbation: (K, P), in units of the largest deviations.
         order: as in `matrix`. ValueError for another order.
         """
-        return (
-            self.nominal
-            + matmul(perturbation, self.gradient)
-            + jnp.sum(perturbation * matmul(perturbation, self.matrix(order)), axis=-1) / 2
-        )
+        bend = jnp.sum(perturbation * matmul(perturbation, self.matrix(order)), axis=-1)
+        return self.nominal + matmul(perturbation, self.gradient) + bend / 2
 
     def moments(self, variances: Array, order: Order) -> tuple[Array, Array]:
         """Mean and standard deviation of q, () each, for independent deviations.
@@ -280,11 +272,9 @@ def predict(problem: AnyProblem, perturbed: PerturbedLens, compensator: Given) -
     # The full search may find rays that aiming does not find.
     if not bool(jnp.isfinite(found.nominal)):
         found = _predict(problem, perturbed, assembly)
-    require(
-        bool(jnp.all(jnp.isfinite(found.hessian))),
-        "criterion: its second derivatives are not finite; trace lenses instead, by `sensitivity` "
-        "or `monte_carlo`",
-    )
+    remedy = "trace lenses instead, by `sensitivity` or `monte_carlo`"
+    finite = bool(jnp.all(jnp.isfinite(found.hessian)))
+    require(finite, f"criterion: its second derivatives are not finite; {remedy}")
     return found
 
 

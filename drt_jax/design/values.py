@@ -68,6 +68,7 @@ model glasses; the surface is that where the glass begins
 """
 
 from collections.abc import Callable
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -151,14 +152,9 @@ class OperandKind(NamedTuple):
         return self.function is relative_illumination
 
 
-def _spot(lens: Lens, rays: FieldRays) -> Array:
-    """Residuals of "spot", (D, V, W, Q), mm."""
-    return rays.spread(rays.bundle.sensor)[0]
-
-
-def _spot_of_colours(lens: Lens, rays: FieldRays) -> Array:
-    """Residuals of "spot_of_colours", (D, V, W, Q), mm."""
-    return rays.spread(rays.bundle.sensor, (-1,))[0]
+def _spot(lens: Lens, rays: FieldRays, axes: tuple[int, ...] = (-2, -1)) -> Array:
+    """Residuals of "spot", or with the axes (-1,) of "spot_of_colours", (D, V, W, Q), mm."""
+    return rays.spread(rays.bundle.sensor, axes)[0]
 
 
 def _spot_chief(lens: Lens, rays: FieldRays) -> Array:
@@ -191,31 +187,23 @@ def _rms_wavefront(lens: Lens, rays: FieldRays) -> Array:
     return safe_sqrt(jnp.sum(_path_difference(lens, rays) ** 2, axis=(1, 2)))
 
 
-def _throughput(lens: Lens, rays: FieldRays) -> Array:
-    """Unvignetted fraction of the light (V,)."""
-    return matmul(rays.throughput, rays.scene.spectrum)
-
-
-def _first_order(get: Callable[[FirstOrder], Array]) -> Function:
-    """A function that returns a first-order value that depends on distance and wavelength, (Z,
-    W).
-    """
+def _at_distances(name: str) -> OperandKind:
+    """The kind of a field of `FirstOrder` that depends on distance and wavelength, (Z, W)."""
 
     def values(lens: Lens, rays: FieldRays) -> Array:
         far, waves = rays.scene.distance[:: rays.fields], rays.scene.wavelengths
-        return jax.vmap(lambda distance: get(first_order(lens, distance, waves)))(far)
+        return jax.vmap(lambda distance: getattr(first_order(lens, distance, waves), name))(far)
 
-    return values
-
-
-def _lens_alone(get: Callable[[FirstOrder], Array]) -> Function:
-    """A function that returns a first-order value that depends on wavelength alone, (W,)."""
-    return lambda lens, rays: get(first_order(lens, jnp.inf, rays.scene.wavelengths))
+    return OperandKind(values, ("wavelengths", "distances"), traced=False)
 
 
-def _back_distance(lens: Lens, rays: FieldRays) -> Array:
-    """Distance from the last vertex to the sensor along the light, (), mm."""
-    return float(lens.senses[-1]) * back_distance(lens)
+def _lens_alone(get: Callable[[FirstOrder], Array]) -> OperandKind:
+    """The kind of a first-order value that depends on wavelength alone, (W,)."""
+
+    def values(lens: Lens, rays: FieldRays) -> Array:
+        return get(first_order(lens, jnp.inf, rays.scene.wavelengths))
+
+    return OperandKind(values, ("wavelengths",), traced=False)
 
 
 def _distortion(lens: Lens, rays: FieldRays) -> Array:
@@ -234,11 +222,6 @@ def _lateral_colour(lens: Lens, rays: FieldRays) -> Array:
     points = rays.sensor_hits[..., 0]
     points = points if rays.symmetry == "none" else points[-1:]
     return points[..., 1:] - points[..., :1]
-
-
-def _chief_ray_angle(lens: Lens, rays: FieldRays) -> Array:
-    """Angles of chief rays with the normal of the sensor, (V, W), radians."""
-    return arrival_angle(lens, rays.bundle)[..., 0]
 
 
 def _numerical_aperture(lens: Lens, rays: FieldRays) -> Array:
@@ -289,13 +272,14 @@ def _glass_map(lens: Lens, rays: FieldRays) -> Array:
 
 _RAYS = ("fields", "wavelengths", "distances")
 _VIEWS = ("distances", "fields")
-_OF_RAYS = (*_VIEWS, "wavelengths", "rays")
-_COLOURS = ("wavelengths",)
+_EACH = (*_VIEWS, "wavelengths")
+_OF_RAYS = (*_EACH, "rays")
 _WAVES_PER_MM = 200.0  # path difference for each mm of miss, for green light at f/5
-_SCALES = ("wavelengths", "distances")
 OPERANDS: dict[str, OperandKind] = {
     "spot": OperandKind(_spot, _RAYS, squared="rms_spot", order=_OF_RAYS),
-    "spot_of_colours": OperandKind(_spot_of_colours, _RAYS, squared="rms_spot", order=_OF_RAYS),
+    "spot_of_colours": OperandKind(
+        partial(_spot, axes=(-1,)), _RAYS, squared="rms_spot", order=_OF_RAYS
+    ),
     "spot_chief": OperandKind(_spot_chief, _RAYS, squared="rms_spot", order=_OF_RAYS),
     "rms_spot": OperandKind(_rms_spot, _RAYS, order=_VIEWS),
     "centroid": OperandKind(_centroid, _RAYS, order=_VIEWS),
@@ -303,40 +287,36 @@ OPERANDS: dict[str, OperandKind] = {
         _path_difference, _RAYS, None, True, "rms_wavefront", _WAVES_PER_MM, _OF_RAYS
     ),
     "rms_wavefront": OperandKind(_rms_wavefront, _RAYS, per_mm=_WAVES_PER_MM, order=_VIEWS),
-    "focal_length": OperandKind(_lens_alone(lambda a: a.focal_length), _COLOURS, traced=False),
-    "effective_focal_length": OperandKind(
-        _lens_alone(lambda a: a.effective_focal_length), _COLOURS, traced=False
-    ),
-    "back_focal_distance": OperandKind(
-        _lens_alone(lambda a: a.back_focal_distance), _COLOURS, traced=False
-    ),
-    "entrance_pupil": OperandKind(
-        _lens_alone(lambda a: 2 * a.entrance_pupil.semi_diameter), _COLOURS, traced=False
-    ),
-    "f_number": OperandKind(_first_order(lambda a: a.f_number), _SCALES, traced=False),
-    "magnification": OperandKind(_first_order(lambda a: a.magnification), _SCALES, traced=False),
+    "focal_length": _lens_alone(lambda a: a.focal_length),
+    "effective_focal_length": _lens_alone(lambda a: a.effective_focal_length),
+    "back_focal_distance": _lens_alone(lambda a: a.back_focal_distance),
+    "entrance_pupil": _lens_alone(lambda a: 2 * a.entrance_pupil.semi_diameter),
+    "f_number": _at_distances("f_number"),
+    "magnification": _at_distances("magnification"),
     "total_track": OperandKind(lambda lens, rays: lens.sensor, (), traced=False),
     "length": OperandKind(lambda lens, rays: jnp.sum(lens.thickness), (), traced=False),
-    "back_distance": OperandKind(_back_distance, (), traced=False),
+    "back_distance": OperandKind(
+        lambda lens, rays: float(lens.senses[-1]) * back_distance(lens), (), traced=False
+    ),
     "distortion": OperandKind(_distortion, _RAYS),
     "lateral_colour": OperandKind(_lateral_colour, _RAYS, order=("xy", *_VIEWS, "later")),
-    "chief_ray_angle": OperandKind(_chief_ray_angle, _RAYS, order=(*_VIEWS, "wavelengths")),
+    "chief_ray_angle": OperandKind(
+        lambda lens, rays: arrival_angle(lens, rays.bundle)[..., 0], _RAYS, order=_EACH
+    ),
     "numerical_aperture": OperandKind(_numerical_aperture, _RAYS),
     "relative_illumination": OperandKind(relative_illumination, ("fields", "distances")),
-    "throughput": OperandKind(_throughput, _RAYS, order=_VIEWS),
+    "throughput": OperandKind(
+        lambda lens, rays: matmul(rays.throughput, rays.scene.spectrum), _RAYS, order=_VIEWS
+    ),
     "mtf": OperandKind(mtf, _RAYS, order=(*_VIEWS, "sections"), at="frequency"),
-    "strehl": OperandKind(strehl, _RAYS, order=(*_VIEWS, "wavelengths")),
+    "strehl": OperandKind(strehl, _RAYS, order=_EACH),
     "encircled_energy": OperandKind(encircled_energy, _RAYS, order=_VIEWS, at="radius"),
     "glass_centre": _gap(True, False),
     "glass_edge": _gap(True, True),
     "air_centre": _gap(False, False),
     "air_edge": _gap(False, True),
     "glass_map": OperandKind(
-        _glass_map,
-        ("surfaces",),
-        model_glasses,
-        traced=False,
-        rows=lambda lens: [*range(lens.count)],
+        _glass_map, ("surfaces",), model_glasses, False, rows=lambda lens: [*range(lens.count)]
     ),
     "incidence_angle": OperandKind(
         _incidence, (*_RAYS, "surfaces"), lambda lens: [*lens.active], order=("surfaces",)

@@ -80,8 +80,7 @@ class Vary:
         require_one_of("variables: kind", self.kind, PARTS)
         what = f"variables: {self.kind}"
         for name in ("surfaces", "terms"):
-            numbers = whole_numbers(f"{what}: {name}", getattr(self, name))
-            object.__setattr__(self, name, numbers)
+            object.__setattr__(self, name, whole_numbers(f"{what}: {name}", getattr(self, name)))
         order = f"low {self.low:g} is not below high {self.high:g}; exchange them"
         require(self.low < self.high, f"{what}: {order}")
         size = f"scale: must be above 0, or 0 to have it chosen, got {self.scale:g}"
@@ -146,11 +145,9 @@ class Tie:
             require(neighbours, f"ties: cemented: expected two neighbours, got {numbers}")
             plain = (self.scale, self.shift) == (1, 0)
             require(plain, "ties: cemented: takes neither scale nor shift; leave them out")
-        require(
-            math.isfinite(self.scale) and self.scale and math.isfinite(self.shift),
-            f"ties: expected a scale that is not 0 and a shift, got {self.scale:g} and "
-            f"{self.shift:g}",
-        )
+        line = math.isfinite(self.scale) and self.scale and math.isfinite(self.shift)
+        got = f"got {self.scale:g} and {self.shift:g}"
+        require(line, f"ties: expected a scale that is not 0 and a shift, {got}")
 
     @property
     def line(self) -> tuple[float, float]:
@@ -165,11 +162,8 @@ class Tie:
         if self.how == "cemented":
             kinds = tuple(kind for kind in _SHAPE if terms[kind])
             one, two = lens.forms[first], lens.forms[others[0]]
-            require(
-                one == two,
-                f"ties: cemented: surfaces {first} and {others[0]} are of the forms {one} and "
-                f"{two}; give both the same form",
-            )
+            are = f"surfaces {first} and {others[0]} are of the forms {one} and {two}"
+            require(one == two, f"ties: cemented: {are}; give both the same form")
         for kind in kinds:
             places_of("ties", lens, kind, self.surfaces)
         return [
@@ -234,11 +228,8 @@ class Variables:
         _refuse_twice("solves", solved, "is what two of them change")
         _refuse_twice("ties", followers, "follows twice")
         for leader, follower, _ in following:
-            require(
-                leader not in followers,
-                f"ties: {leader}, which {follower} follows, itself follows from a tie or a solve; "
-                "begin with another surface",
-            )
+            what = f"ties: {leader}, which {follower} follows, itself follows from a tie or a solve"
+            require(leader not in followers, f"{what}; begin with another surface")
         # If all numbers of a kind vary, tied and solved ones are left out. Naming one is an error.
         for place, v in found:
             free = not (place in followers and v.surfaces)

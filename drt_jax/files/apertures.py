@@ -8,7 +8,8 @@ import numpy as np
 from ..lens.aperture import Apertures
 from ..lens.forms import FORMS
 from ..lens.polygon import CORNERS, convex_pieces, tidied
-from .entry import Entry, array
+from ..numerics import array
+from .entry import Entry
 
 KINDS = ("circle", "ellipse", "rectangle", "polygon")
 _MOST = 6  # obscurations per lens: n of them multiply the number of rays by 2^n

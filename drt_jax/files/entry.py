@@ -6,12 +6,10 @@ import math
 from collections.abc import Iterator, Sequence
 from typing import Any
 
-import jax
-import jax.numpy as jnp
-import numpy as np
 from jax import Array
 
 from ..inputs import InputError, shown
+from ..numerics import array
 
 # The largest magnitudes of numbers, beyond any lens and far below overflow: LONG of lengths in mm
 # and most others, STEEP of curvatures and conics, WIDE of coefficients and radii.
@@ -132,11 +130,6 @@ class Entry(dict[Any, Any]):
         what = f"{value:g} is no surface; a plane is {radius}: inf"
         self.require(abs(value) >= 1 / STEEP, radius, what)
         return 1 / value
-
-
-def array(values: object) -> Array:
-    """Numbers as an array of the default floating dtype, made without any compilation."""
-    return jax.device_put(np.asarray(values, jnp.result_type(float)))
 
 
 def table(rows: list[list[float]], width: int) -> Array:

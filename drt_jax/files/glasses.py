@@ -31,8 +31,7 @@ _M2 = np.array([8.84931, -6.91677, 0.454415])
 
 def code_of(word: str) -> tuple[float, float] | None:
     """nd and vd of a code as 517642, 517.642, 516800.641700 or 1.5168:64.17; None for a name."""
-    found = _CODE.fullmatch(word)
-    if found:
+    if found := _CODE.fullmatch(word):
         return float(f"1.{found[1]}"), float(f"{found[2][:2]}.{found[2][2:]}")
     if _SHORT_CODE.fullmatch(word):
         return 1 + int(word[:3]) / 1000, int(word[3:]) / 10

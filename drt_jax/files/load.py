@@ -62,8 +62,8 @@ class System:
     wavelengths: np.ndarray
     wavelength_weights: np.ndarray
     primary: int
-    aperture: float | None
-    aperture_kind: ApertureKind | None
+    aperture: float | None = None
+    aperture_kind: ApertureKind | None = None
     ray_aiming: str = ""
     notes: tuple[str, ...] = ()
     configurations: int = 1
@@ -106,8 +106,6 @@ class System:
             wavelengths=waves,
             wavelength_weights=weights(scene.wavelength_weights, len(waves)),
             primary=primary,
-            aperture=None,
-            aperture_kind=None,
         )
 
     @property
@@ -347,13 +345,12 @@ def _opened(record: Record, lens: Lens) -> Lens:
 def _without_rim(lens: Lens) -> Lens:
     """The lens without the first clear circle about the vertex of its stop. The stop itself has
     the same size, and clipping at both would lose rays by rounding."""
-    own = lens.apertures
+    own, rim = lens.apertures, (lens.stop, "circle", False)
     if own is None:
         return lens
-    lies = zip(own.surfaces, own.kinds, own.blocks, strict=True)
-    rims = [k for k, place in enumerate(lies) if place == (lens.stop, "circle", False)]
-    keep = [k for k in range(len(own.surfaces)) if k not in rims[:1]]
-    return dataclasses.replace(lens, apertures=own.only(keep) if keep else None)
+    lies = [*zip(own.surfaces, own.kinds, own.blocks, strict=True)]
+    keep = [k for k, place in enumerate(lies) if place != rim or rim in lies[:k]]
+    return dataclasses.replace(lens, apertures=own.only(keep))
 
 
 def _angles(record: Record, lens: Lens) -> np.ndarray | None:

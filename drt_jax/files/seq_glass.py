@@ -1,5 +1,6 @@
 """Glasses of `.seq` files: names, codes, and private catalogues between PRV and END."""
 
+import bisect
 import re
 from typing import Any
 
@@ -145,10 +146,9 @@ def schott_through(
 def _near(table: list[tuple[float, float]], system: list[float]) -> list[tuple[float, float]]:
     """The rows of a table between the wavelengths of the file, extended on both sides to at least
     eight rows."""
-    inside = [k for k, (wave, _) in enumerate(table) if min(system) <= wave <= max(system)]
-    above = sum(wave < min(system) for wave, _ in table)
-    first = max((inside or [above])[0] - 1, 0)
-    end = min((inside or [above - 1])[-1] + 2, len(table))
+    waves = [wave for wave, _ in table]
+    first = max(bisect.bisect_left(waves, min(system)) - 1, 0)
+    end = min(bisect.bisect_right(waves, max(system)) + 1, len(table))
     while end - first < 8 and end - first < len(table):
         first, end = max(first - 1, 0), min(end + 1, len(table))
     return table[first:end]

@@ -26,8 +26,9 @@ from ..lens.paraxial import (
 )
 from ..lens.phase import Phase
 from ..lens.scene import D_LINE
+from ..numerics import array
 from .apertures import apertures_of, semi_diameter
-from .entry import STEEP, WIDE, Entry, LensError, array, require, table
+from .entry import STEEP, WIDE, Entry, LensError, require, table
 
 SURFACES = 5000  # surfaces
 _ELEMENTS = 500
@@ -132,13 +133,11 @@ def _elements(top: Entry, count: int) -> Elements | None:
 
 def _span(entry: Entry, count: int) -> tuple[int, int]:
     """The first and the last surface of an element."""
-    given = entry.get("surfaces")
-    wrong = entry.error("surfaces", f"expected [first, last], got {shown(given)}")
-    if not isinstance(given, list | tuple) or len(given) != 2:
-        raise wrong
+    given: Any = entry.get("surfaces")
+    wrong = f"expected [first, last], got {shown(given)}"
+    entry.require(isinstance(given, list | tuple) and len(given) == 2, "surfaces", wrong)
     first, last = (_row(entry, "surfaces", end, count) for end in given)
-    if first > last:
-        raise wrong
+    entry.require(first <= last, "surfaces", wrong)
     return first, last
 
 
@@ -179,8 +178,7 @@ def _medium(entry: Entry, own: dict[str, Glass]) -> Glass:
         with entry.naming("nd"):
             glass = model_glass(*values)
         return glass
-    what = "belongs to a model glass: give nd and vd as well"
-    entry.require("dPgF" not in entry, "dPgF", what)
+    entry.require("dPgF" not in entry, "dPgF", "belongs to a model glass: give nd and vd as well")
     if "index" in entry:
         value = entry.number("index")
         entry.require(1 <= value <= _DENSEST, "index", f"{value:g} is not between 1 and {_DENSEST}")

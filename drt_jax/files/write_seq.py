@@ -114,8 +114,7 @@ def _lines(system: System, several: bool) -> list[str]:
     places = _places(lens)
     for i in range(lens.count):
         word = "REFL" if lens.mirrors[i] else words[i + 1]
-        numbers = f"{float(lens.curvature[i])!r} {gap_behind(lens, i)!r}"
-        lines.append(f"S {numbers} {word}".rstrip())
+        lines.append(f"S {float(lens.curvature[i])!r} {gap_behind(lens, i)!r} {word}".rstrip())
         entry = entry_of(lens, i, {}) | ({"conic": float(lens.conic[i])} if several else {})
         lines += [f"  {line}" for line in _surface(i, entry) + places[i]]
     lines.append(f"SI {float(lens.curvature[-1])!r} 0.0")

@@ -191,8 +191,7 @@ def read_zmx(
             number, due = words.count(), len(surfaces)
             words.require(number == due, f"SURF {number} stands where SURF {due} should")
             words.require(due <= SURFACES, f"more than {SURFACES} surfaces")
-            name = f"SURF {number}"
-            own = Surface(record, name, words.line, head.unit, makers=head.makers)
+            own = Surface(record, f"SURF {number}", words.line, head.unit, makers=head.makers)
             surfaces.append(own)
         elif words.key == "MNUM":
             tail = whole = True

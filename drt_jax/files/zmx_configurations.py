@@ -70,11 +70,10 @@ def _write(record: Record, found: list[Words], row: Words) -> None:
     known = key in (*_SURFACE, *_FIELD, *_WAVE, "APER")
     row.require(known, f"{what}: not supported; save each configuration as a file of its own")
     row.number(2)  # LensError if it is not a number
-    first = next((k for k, words in enumerate(found) if words.key == "SURF"), 0)
-    head = found[:first]
+    starts = [k for k, words in enumerate(found) if words.key == "SURF"]
+    head = found[: min(starts, default=0)]
     what = f"{key} {where}: the file has none"
     if key in _SURFACE:
-        starts = [k for k, words in enumerate(found) if words.key == "SURF"]
         row.require(0 <= where < len(starts), what)
         start, end = starts[where], [*starts, len(found)][where + 1]
         name = _SURFACE[key]

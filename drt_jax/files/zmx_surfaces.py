@@ -280,8 +280,7 @@ def _forbes(surface: Surface) -> None:
     if not any(found):
         return
     if kind == 0:
-        terms = {m: a for m, a in enumerate(found) if a}
-        surface.shape("qbfs", terms, norm_radius=radius)
+        surface.shape("qbfs", {m: a for m, a in enumerate(found) if a}, norm_radius=radius)
         return
     surface.require(not any(found[_QCON:]), f"of Qcon {_QCON} terms are exact enough as powers")
     total: dict[int, float] = {}

@@ -4,7 +4,6 @@ and obscurations.
 
 import dataclasses
 import itertools
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -12,7 +11,7 @@ import numpy as np
 from jax import Array
 
 from ..inputs import require
-from ..numerics import concrete, safe_divide, safe_sqrt
+from ..numerics import concrete, safe_divide, safe_sqrt, selected
 from .polygon import convex_pieces
 
 
@@ -47,6 +46,7 @@ class Apertures:
     pieces: tuple[tuple[tuple[int, ...], ...], ...] = dataclasses.field(
         metadata={"static": True}, kw_only=True, default=()
     )
+    only = selected
 
     def __post_init__(self) -> None:
         if not self.pieces and self.corners is None:
@@ -72,13 +72,6 @@ class Apertures:
             else:
                 rows.append(self.half[k, np.array([0, int(kind != "circle")])])
         return jnp.stack(rows)
-
-    def only(self, keep: list[int]) -> "Apertures":
-        """A selection of the apertures. keep: their numbers."""
-        names, rows = ("surfaces", "kinds", "blocks", "pieces"), np.array(keep)
-        static: dict[str, Any] = {n: tuple(getattr(self, n)[k] for k in keep) for n in names}
-        centre, corners = (a if a is None else a[rows] for a in (self.centre, self.corners))
-        return Apertures(self.half[rows], centre, corners, **static)
 
     def outline(self, k: int) -> Array:
         """The corners (N, 2) of polygon k from its centre, mm."""

@@ -70,10 +70,9 @@ def bent(
     """
     faces, dtype = _group(lens, surfaces), lens.curvature.dtype
     wave = real_array("wavelength", wavelength, dtype)
-    more = lens.curvature.at[faces.start : faces.stop - 1].add(
-        real_array("curvature", curvature, dtype)
-    )
-    found, last = dataclasses.replace(lens, curvature=more), faces.stop - 1
+    added, last = real_array("curvature", curvature, dtype), faces.stop - 1
+    more = lens.curvature.at[faces.start : last].add(added)
+    found = dataclasses.replace(lens, curvature=more)
     return _solved(found, last, faces, _power(lens, faces, wave), wave)
 
 

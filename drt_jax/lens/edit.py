@@ -11,11 +11,10 @@ import numpy as np
 from jax import Array
 
 from ..inputs import require
-from ..numerics import Numbers, concrete, real_array
+from ..numerics import Numbers, concrete, real_array, selected
 from .forms import FORMS
 from .lens import Labels, Lens
 from .paraxial import entrance_pupil
-from .phase import Phase
 
 # How the named coefficients of forms change: the power of the size with which they scale, and their
 # sign if the sag changes sign.
@@ -115,13 +114,10 @@ def reindexed(lens: Lens, rows: Sequence[int], media: Sequence[int], thickness: 
     replace = dataclasses.replace
     if phase is not None:
         ruled = phase.surfaces
-        order = sorted(stay(ruled), key=lambda k: new[ruled[k]])
-        rows_of_phase, surfaces = np.array(order, int), numbers(ruled[k] for k in order)
-        own = phase.coefficients[rows_of_phase], phase.order[rows_of_phase]
-        phase = Phase(*own, surfaces, tuple(phase.forms[k] for k in order)) if order else None
+        phase = selected(phase, sorted(stay(ruled), key=lambda k: new[ruled[k]]))
+        phase = phase and replace(phase, surfaces=numbers(phase.surfaces))
     if apertures is not None:
-        left = stay(apertures.surfaces)
-        apertures = apertures.only(left) if left else None
+        apertures = apertures.only(stay(apertures.surfaces))
         apertures = apertures and replace(apertures, surfaces=numbers(apertures.surfaces))
     if elements is not None:
         spans = tuple((new[first], new[last]) for first, last in elements.spans)

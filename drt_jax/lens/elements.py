@@ -4,10 +4,9 @@ import dataclasses
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax import Array
 
-from ..numerics import matmul
+from ..numerics import matmul, selected
 
 
 @jax.tree_util.register_dataclass
@@ -33,12 +32,7 @@ class Elements:
     pivot: Array
     spans: tuple[tuple[int, int], ...] = dataclasses.field(metadata={"static": True})
     about: tuple[int, ...] = dataclasses.field(metadata={"static": True})
-
-    def only(self, keep: list[int]) -> "Elements":
-        """A selection of the groups. keep: their numbers."""
-        shift, tilt, pivot = (a[np.array(keep)] for a in (self.shift, self.tilt, self.pivot))
-        spans, about = tuple(self.spans[g] for g in keep), tuple(self.about[g] for g in keep)
-        return Elements(shift, tilt, pivot, spans, about)
+    only = selected
 
     def carry(self, axis: Array, point: Array, rotation: Array) -> tuple[Array, Array]:
         """Moves surfaces with their groups, the inner groups first.
@@ -55,10 +49,8 @@ class Elements:
             turn = rotation_matrix(self.tilt[g])
             pivot = jnp.zeros_like(point[:1]).at[:, 2].set(axis[self.about[g]] + self.pivot[g])
             moved = pivot + self.shift[g][None] + matmul(point[own] - pivot, turn.T)
-            point, rotation = (
-                point.at[own].set(moved),
-                rotation.at[own].set(matmul(turn[None], rotation[own])),
-            )
+            point = point.at[own].set(moved)
+            rotation = rotation.at[own].set(matmul(turn[None], rotation[own]))
         return point, rotation
 
 

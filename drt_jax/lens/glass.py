@@ -9,7 +9,7 @@ import numpy as np
 from jax import Array
 
 from ..inputs import require
-from ..numerics import concrete, matmul, program, safe_divide, safe_sqrt
+from ..numerics import array, concrete, matmul, program, safe_divide, safe_sqrt
 
 # Of model glasses: the lines d, F, C, g (um), and the powers of the wavelength L in Conrady's
 # formula.
@@ -121,10 +121,6 @@ class Dispersion:
         padded = np.stack([np.pad(half, ((0, 0), (0, terms - half.shape[1]))) for half in halves])
         powers = max(len(m.schott) for m in media)
         models, dPgF = [m.model for m in media], [m.dPgF for m in media]
-
-        def array(values):
-            return jax.device_put(np.asarray(values, jnp.result_type(float)))
-
         return cls(
             strength=array(padded[:, 0]),
             resonance=array(padded[:, 1]),

@@ -80,8 +80,7 @@ def _table() -> dict[str, list[_Entry]]:
         differ = len({(g.sellmeier, g.schott, g.range) for _, g in entries}) > 1
         for k, (plain, glass) in enumerate(entries):
             if not plain and (differ or entries[0].plain):
-                named = dataclasses.replace(glass, name=f"{name}_{glass.maker}")
-                entries[k] = _Entry(plain, named)
+                entries[k] = _Entry(plain, dataclasses.replace(glass, name=f"{name}_{glass.maker}"))
     return table
 
 
@@ -178,11 +177,8 @@ def flaw(glass: Glass) -> str:
     waves = np.linspace(low, high, 257)
     with np.errstate(all="ignore"):
         wrong = waves[~(indices(glass, waves) > 1)]
-    return (
-        f"no index above 1 at {wrong[0]:g} um; mend the constants or the range"
-        if len(wrong)
-        else ""
-    )
+    remedy = "mend the constants or the range"
+    return f"no index above 1 at {wrong[0]:g} um; {remedy}" if len(wrong) else ""
 
 
 def map_point(glass: Glass) -> tuple[float, float] | None:
@@ -199,8 +195,7 @@ def map_point(glass: Glass) -> tuple[float, float] | None:
 @functools.cache
 def _mapped() -> tuple[list[_Entry], np.ndarray]:
     """All solids that have nd and vd; and their nd and vd (G, 2)."""
-    others = {"air", "water"}
-    solids = (own for name, own in _table().items() if name.lower() not in others)
+    solids = (own for name, own in _table().items() if name.lower() not in ("air", "water"))
     each = ((entry, map_point(entry.glass)) for entry in itertools.chain(*solids))
     entries, points = zip(*((entry, point) for entry, point in each if point), strict=True)
     return [*entries], np.array(points)

@@ -19,11 +19,11 @@ from .lens import Labels, Lens
 from .paraxial import marginal_ray, paraxial_system
 
 
-def _surface(lens: Lens, name: str, surface: int) -> int:
-    """A surface of the lens; ValueError for another number."""
+def _surface(lens: Lens, name: str, surface: int, least: int = 0) -> int:
+    """A surface of the lens; ValueError for another number. least: -1 to take that, too."""
     (number,) = whole_numbers(name, (surface,))
     count = lens.count
-    require(0 <= number < count, f"{name}: expected one from 0 to {count - 1}, got {surface}")
+    require(least <= number < count, f"{name}: expected one from 0 to {count - 1}, got {surface}")
     return number
 
 
@@ -56,10 +56,8 @@ def inserted(
     The new surfaces have the numbers `surface + 1` and `surface + 2`, and no aperture. All others
     and the sensor stay where they are. z and object distances count from the new first surface.
     """
-    (i,) = whole_numbers("surface", (surface,))
-    i = -1 if i == -1 else _surface(lens, "surface", i)
-    row = max(i, 0) if like is None else like
-    row = -1 if row == -1 else _surface(lens, "like", row)
+    i = _surface(lens, "surface", surface, -1)
+    row = max(i, 0) if like is None else _surface(lens, "like", like, -1)
     around = lens.glasses[i + 1]
     own = glass if isinstance(glass, int) else i + 1
     require(0 <= own <= lens.count, f"glass: expected a medium from 0 to {lens.count}, got {own}")
@@ -144,8 +142,7 @@ def with_dummy(
     All others and the sensor stay where they are. z and object distances count from the new first
     surface.
     """
-    (i,) = whole_numbers("surface", (surface,))
-    i = -1 if i == -1 else _surface(lens, "surface", i)
+    i = _surface(lens, "surface", surface, -1)
     gaps, count = lens.thickness, lens.count
     far = float(lens.senses[i + 1]) * real_array("distance", distance, gaps.dtype)[None]
     around = gaps[max(i, 0) : i + 1]

@@ -66,11 +66,9 @@ def joined(first: Lens, second: Lens, gap: Numbers, stop: str = "first") -> Lens
     require(not concrete(space) or space > 0, f"gap: expected mm above 0, got {gap}")
     elements, apertures = first.elements, first.apertures
     if apertures is not None:
-        left = [k for k, i in enumerate(apertures.surfaces) if i < count]
-        apertures = apertures.only(left) if left else None
+        apertures = apertures.only([k for k, i in enumerate(apertures.surfaces) if i < count])
     if elements is not None:
-        left = [g for g, (begin, _) in enumerate(elements.spans) if begin < count]
-        elements = elements.only(left) if left else None
+        elements = elements.only([g for g, span in enumerate(elements.spans) if span[0] < count])
         about = () if elements is None else elements.about
         require(count not in about, "first: an element turns about its sensor")
     first = dataclasses.replace(first, elements=elements, apertures=apertures)

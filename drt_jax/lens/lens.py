@@ -338,9 +338,7 @@ class Lens:
         schott, strength = self.dispersion.schott, self.dispersion.strength
         if concrete((schott, strength)):
             vacuum = np.eye(1, schott.shape[1])
-            odd = np.any(np.asarray(schott) != vacuum, axis=1) | np.any(
-                np.asarray(strength), axis=1
-            )
+            odd = (np.asarray(schott) != vacuum).any(axis=1) | np.asarray(strength).any(axis=1)
             for i in np.flatnonzero(odd & (np.array(self.glasses) == "air")):
                 return f"lens.dispersion: medium {i} is called air and has another index{_REMEDY}"
         return ""

@@ -68,8 +68,7 @@ class Scene:
         shape, far = angles.shape, np.shape(known_array("distance", distance))
         require(shape in ((), (2,)), f"field: expected one angle or two, got shape {shape}")
         require(len(far) < 2, f"distance: expected one number or (Z,), got shape {far}")
-        pair = angles if angles.ndim else _pairs(angles)
-        return cls._made(pair, distance, wavelengths, weights)
+        return cls._made(angles if angles.ndim else _pairs(angles), distance, wavelengths, weights)
 
     @classmethod
     def radians(
@@ -173,10 +172,8 @@ class Scene:
     def flat(self) -> tuple[Array, Array]:
         """Field (P, 2) and distance (P,) of all points; of known numbers as NumPy arrays."""
         there = np if concrete((self.field, self.distance)) else jnp
-        return (
-            there.broadcast_to(self.field, (*self.shape, 2)).reshape(-1, 2),
-            there.broadcast_to(self.distance, self.shape).reshape(-1),
-        )
+        fields = there.broadcast_to(self.field, (*self.shape, 2))
+        return fields.reshape(-1, 2), there.broadcast_to(self.distance, self.shape).reshape(-1)
 
     @property
     def possible(self) -> Array:
@@ -245,10 +242,8 @@ def checked_scene(lens: Lens, scene: Scene) -> Scene:
     try:
         np.broadcast_shapes(field.shape[:-1], distance.shape)
     except ValueError:
-        raise ValueError(
-            f"distance: expected one, or one for each of the fields {field.shape[:-1]}, got shape "
-            f"{distance.shape}"
-        ) from None
+        what = f"distance: expected one, or one for each of the fields {field.shape[:-1]}"
+        raise ValueError(f"{what}, got shape {distance.shape}") from None
     return Scene(field, distance, waves, weights, scene.field_weights)
 
 

@@ -129,11 +129,9 @@ def third_order(lens: Lens, scene: Scene) -> ThirdOrder:
     require(not others, f"third order: no theory for surfaces of the form {', '.join(others)}")
     require(lens.phase is None, "third order: no theory for diffractive surfaces")
     moves = lens.decentre, lens.tilt, lens.elements and (lens.elements.shift, lens.elements.tilt)
-    if any(np.any(move) for move in jax.tree.leaves(known_values(moves))):
-        raise ValueError(
-            "third order: no theory for tilted or decentred surfaces; set lens.tilt, lens.decentre "
-            "and lens.elements to None for the lens without them"
-        )
+    moved = any(np.any(move) for move in jax.tree.leaves(known_values(moves)))
+    remedy = "set lens.tilt, lens.decentre and lens.elements to None for the lens without them"
+    require(not moved, f"third order: no theory for tilted or decentred surfaces; {remedy}")
     across = known_values(scene.field)
     if across is not None and np.any(np.asarray(across)[..., 0]):
         raise ValueError("field: third order: give an angle along y, for x and y their diagonal")

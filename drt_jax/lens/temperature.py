@@ -114,10 +114,8 @@ def at_temperature(
     """
     require(lens.dispersion.thermal is None, "lens: is at another temperature; take that at 20 C")
     dtype, count, media = lens.curvature.dtype, lens.count, np.array(lens.glasses)
-    now, pressed = (
-        real_array(name, value, dtype)
-        for name, value in (("celsius", celsius), ("pressure", pressure))
-    )
+    now = real_array("celsius", celsius, dtype)
+    pressed = real_array("pressure", pressure, dtype)
     require(now.shape == pressed.shape == (), "celsius, pressure: expected one number of each")
     shapes = model.index.shape, model.surfaces.shape
     require(shapes == ((count + 1, 6), (count + 1,)), "model: of a lens with other surfaces")
