@@ -176,7 +176,7 @@ class View(NamedTuple):
     fields: degrees; an empty list if neither options nor file give any, see `lit`.
     distance: of the object, mm.
     wavelengths, weights: wavelengths, um, of which the middle one is the reference, and weights.
-    note: a line about wavelengths of the file that are left out, or "".
+    note: a line about fields and wavelengths of the file that are left out, or "".
     """
 
     lens: Lens
@@ -290,7 +290,7 @@ def field_rows(
         if ENDS[Status.CROSSED] in beam.ends:
             wide = np.where(np.isinf(lens.semi_diameter), 1.3 * beam.wide, lens.semi_diameter)
             where = crossed(dataclasses.replace(lens, semi_diameter=jnp.asarray(wide)))
-            yield f"  ! rays that would have to step back do not arrive{where}"
+            yield f"  ! rays that meet two surfaces in the wrong order do not arrive{where}"
         if field == 0 and f"{light:.2f}" != "100.00" and not (beam.obscured and not beam.ends):
             share = f"{100 - light:.2g} % of the light that fills the stop"
             yield f"  ! on the axis {share} is vignetted; limiting surfaces: {cut}"
